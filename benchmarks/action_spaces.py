@@ -15,9 +15,8 @@ import numpy as np
 
 from mme_vla.envs import make_env
 from mme_vla.envs.make import make_task
-from mme_vla.envs.metadata import episode
+from mme_vla.envs.metadata import TASK_NAMES, episode
 from mme_vla.envs.recording.recorder import RecordedStep, Recorder
-from mme_vla.envs.task_names import TASK_NAMES
 
 SPACES = {"joint_angle": "joint_action", "ee_pose": "eef_action", "waypoint": "waypoint_action", "multi_choice": ""}
 
@@ -26,8 +25,8 @@ def actions(steps: list[RecordedStep], space: str) -> list[Any]:
     """What to do from the first execution step on."""
     steps = [step for step in steps if not step.info["is_video_demo"]]
     if space == "multi_choice":
-        chosen = [json.loads(step.action["choice_action"]) for step in steps if step.info["is_subgoal_boundary"]]
-        return [choice for choice in chosen if choice["choice"]]
+        choices = [json.loads(step.action["choice_action"]) for step in steps if step.info["is_subgoal_boundary"]]
+        return [choice for choice in choices if choice["choice"]]
     every = [step.action[SPACES[space]] for step in steps]
     if space != "waypoint":
         return every
@@ -72,9 +71,9 @@ def main() -> None:
         for task in args.tasks:
             count = range(args.episodes)
             ends = list(pool.map(replay, [task] * len(count), count, [args.split] * len(count)))
-            shown = [end for end in ends if end]
-            cells = [f"{sum(end[space] == 'success' for end in shown)}/{len(shown)}" for space in SPACES]
-            print(f"| {task} | {len(shown)}/{len(count)} | " + " | ".join(cells) + " |", flush=True)
+            completed = [end for end in ends if end]
+            cells = [f"{sum(end[space] == 'success' for end in completed)}/{len(completed)}" for space in SPACES]
+            print(f"| {task} | {len(completed)}/{len(count)} | " + " | ".join(cells) + " |", flush=True)
             others += [(task, i, s, e) for i, end in enumerate(ends) for s, e in end.items() if e != "success"]
     for task, index, space, end in others:
         print(f"{task} {index}, {space}: {end}")

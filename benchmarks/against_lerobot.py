@@ -35,21 +35,24 @@ PROMPT_LENGTH, PROMPT_USED, HORIZON = 200, 60, 20
 
 def lerobot_pi05(dtype: str, reduced: bool = True) -> nn.Module:
     """LeRobot's PI05 network, reduced by its size functions answering `SIZES`; how it computes is not touched."""
-    from lerobot.policies.pi05 import modeling_pi05 as theirs
+    from lerobot.policies.pi05 import modeling_pi05 as source_module
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
     config = PI05Config(
         dtype=dtype, chunk_size=HORIZON, n_action_steps=HORIZON, freeze_vision_encoder=True, device="cpu"
     )
     if not reduced:
-        return theirs.PI05Pytorch(config)
+        return source_module.PI05Pytorch(config)
 
-    def sizes_of(variant: str) -> theirs.GemmaConfig:
+    def sizes_of(variant: str) -> source_module.GemmaConfig:
         expert = SIZES["vlm"] if variant == "gemma_2b" else SIZES["action"]
         shared = {key: SIZES[key] for key in ("depth", "num_heads", "num_kv_heads", "head_dim")}
-        return theirs.GemmaConfig(**expert, **shared)
+        return source_module.GemmaConfig(**expert, **shared)
 
-    vlm_class, expert_class = theirs.PaliGemmaForConditionalGenerationWithPiGemma, theirs.PiGemmaForCausalLM
+    vlm_class, expert_class = (
+        source_module.PaliGemmaForConditionalGenerationWithPiGemma,
+        source_module.PiGemmaForCausalLM,
+    )
 
     def reduced_vlm(config):
         vision = SIZES["vision"]
@@ -71,8 +74,8 @@ def lerobot_pi05(dtype: str, reduced: bool = True) -> nn.Module:
         "PaliGemmaForConditionalGenerationWithPiGemma": reduced_vlm,
         "PiGemmaForCausalLM": reduced_expert,
     }
-    with patch.multiple(theirs, **reduced_parts):
-        return theirs.PI05Pytorch(config)
+    with patch.multiple(source_module, **reduced_parts):
+        return source_module.PI05Pytorch(config)
 
 
 def our_pi05(dtype: str) -> nn.Module:
@@ -109,41 +112,41 @@ def main() -> None:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
     b = args.batch
-    pictures = torch.randint(0, 256, (b, 2, 3, 224, 224), dtype=torch.uint8, device=device)
-    floats = list((pictures.float() / 127.5 - 1).unbind(1))
-    seen = [torch.ones(b, dtype=torch.bool, device=device)] * 2
+    images = torch.randint(0, 256, (b, 2, 3, 224, 224), dtype=torch.uint8, device=device)
+    floats = list((images.float() / 127.5 - 1).unbind(1))
+    masks = [torch.ones(b, dtype=torch.bool, device=device)] * 2
     tokens = torch.randint(4, SIZES["vocab_size"], (b, PROMPT_LENGTH), device=device)
     used = (torch.arange(PROMPT_LENGTH, device=device) < PROMPT_USED).expand(b, -1)
     actions, noise = torch.randn(2, b, HORIZON, 32, device=device).unbind(0)
     time = torch.full((b,), 0.5, device=device)
-    batch = Batch(pictures, torch.stack(seen, 1), tokens, used, actions=actions)
+    batch = Batch(images, torch.stack(masks, 1), tokens, used, actions=actions)
 
-    ours, theirs = our_pi05(args.dtype).to(device), lerobot_pi05(args.dtype).to(device)
+    target, source = our_pi05(args.dtype).to(device), lerobot_pi05(args.dtype).to(device)
 
     def their_loss() -> Tensor:
-        return theirs.forward(floats, seen, tokens, used, actions, noise, time).mean()
+        return source.forward(floats, masks, tokens, used, actions, noise, time).mean()
 
     def their_chunk() -> Tensor:
-        theirs.eval()
+        source.eval()
         with torch.no_grad():
-            return theirs.sample_actions(floats, seen, tokens, used, noise=noise, num_steps=10)
+            return source.sample_actions(floats, masks, tokens, used, noise=noise, num_steps=10)
 
     if args.compile:
-        ours.backbone.compile(dynamic=False)
+        target.backbone.compile(dynamic=False)
     cut = batch.without_prompt_padding()
-    assert (ours.sample_actions(batch, noise) - ours.sample_actions(cut, noise)).abs().max() < 1e-4
+    assert (target.sample_actions(batch, noise) - target.sample_actions(cut, noise)).abs().max() < 1e-4
 
-    def our_chunk(given: Batch) -> Callable[[], Tensor]:
-        return lambda: ours.eval().sample_actions(given, noise)
+    def our_chunk(inputs: Batch) -> Callable[[], Tensor]:
+        return lambda: target.eval().sample_actions(inputs, noise)
 
-    for model, name in ((ours, "ours"), (theirs, "LeRobot")):
+    for model, name in ((target, "ours"), (source, "LeRobot")):
         print(f"{name:8} {sum(p.numel() for p in model.parameters()) / 1e6:.2f} M parameters")
     compiled = ", ours compiled" if args.compile else ""
     print(f"{machine()}; batch {b}, {args.dtype}, median of {args.rounds}{compiled}")
     steps = {
-        "LeRobot": trainer(theirs, their_loss),
-        "ours, 200 tokens": trainer(ours, lambda: ours(batch, noise, time)[0]),
-        "ours, padding dropped": trainer(ours, lambda: ours(cut, noise, time)[0]),
+        "LeRobot": trainer(source, their_loss),
+        "ours, 200 tokens": trainer(target, lambda: target(batch, noise, time)[0]),
+        "ours, padding dropped": trainer(target, lambda: target(cut, noise, time)[0]),
     }
     chunks = {
         "LeRobot": their_chunk,

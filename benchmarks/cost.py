@@ -19,7 +19,7 @@ from mme_vla.config.composition import compose
 from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS, NEURAL, random_batch
-from mme_vla.training.console import resident_gib
+from mme_vla.training.logging import resident_gib
 from mme_vla.types import Batch
 
 TERA = 1e12
@@ -28,7 +28,7 @@ OF_BUDGETS = ("framesamp_modul", "tokendrop_expert")
 
 
 def full_batch(policy: MMEPolicy, batch: int, prompt: int) -> Batch:
-    """Noise pictures, a prompt of `prompt` tokens without padding, and a memory that is full."""
+    """Noise images, a prompt of `prompt` tokens without padding, and a memory that is full."""
     made = random_batch(policy, batch, valid=policy.memory.capacity if policy.memory else 0)
     made.prompt = torch.full((batch, prompt), 5)
     made.prompt_mask = torch.ones(batch, prompt, dtype=torch.bool)
@@ -41,13 +41,13 @@ def count(models: list[str]) -> None:
           "| past frames |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|")  # fmt: skip
     reference = count_model("pi05").chunk
     for model in models:
-        found = count_model(model)
+        model_cost = count_model(model)
         cells = [
-            str(found.prompt), f"{found.parameters / 1e6:,.1f} M", f"{found.forward / TERA:.3f} T",
-            f"{found.chunk / TERA:.3f} T", f"{found.chunk / reference:.2f}x",
-            f"{found.memory / TERA:.4f} T" if found.memory else "",
-            "" if found.streamed is None else f"{found.streamed / TERA:.4f} T",
-            f"{found.frames / TERA:.3f} T" if model in (*NEURAL, *ALL_BEYOND) else "",
+            str(model_cost.prompt), f"{model_cost.parameters / 1e6:,.1f} M", f"{model_cost.forward / TERA:.3f} T",
+            f"{model_cost.chunk / TERA:.3f} T", f"{model_cost.chunk / reference:.2f}x",
+            f"{model_cost.memory / TERA:.4f} T" if model_cost.memory else "",
+            "" if model_cost.streamed is None else f"{model_cost.streamed / TERA:.4f} T",
+            f"{model_cost.frames / TERA:.3f} T" if model in (*NEURAL, *ALL_BEYOND) else "",
         ]  # fmt: skip
         print(f"| `{model}` | {' | '.join(cells)} |")
 
@@ -57,8 +57,8 @@ def budgets() -> None:
     head = " | ".join(f"{budget:,}" for budget in BUDGETS)
     print(f"| model | | {head} |\n|---|---|{'---:|' * len(BUDGETS)}")
     for model in OF_BUDGETS:
-        found = [count_model(model, budget) for budget in BUDGETS]
-        rows = {"forward pass": [cost.forward for cost in found], "sampled chunk": [cost.chunk for cost in found]}
+        costs = [count_model(model, budget) for budget in BUDGETS]
+        rows = {"forward pass": [cost.forward for cost in costs], "sampled chunk": [cost.chunk for cost in costs]}
         for what, values in rows.items():
             print(f"| `{model}` | {what} | {' | '.join(f'{value / TERA:.3f} T' for value in values)} |")
 

@@ -19,7 +19,7 @@ def grow(copies: int, folder: Path) -> Path:
     """A dataset of `copies` times the sample's episodes."""
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    from mme_vla.data.layout import SAMPLE
+    from mme_vla.data.lerobot_files import SAMPLE
 
     if copies == 1:
         return SAMPLE
@@ -44,7 +44,7 @@ def measure(root: Path, model: str, items: int, caches: Path) -> tuple[int, floa
     import torch
 
     from mme_vla import build_policy
-    from mme_vla.data.cache.ensure import ensure_cache
+    from mme_vla.data.cache_building import ensure_cache
     from mme_vla.data.dataset import TrainingDataset
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.data.statistics import compute_norm_stats

@@ -10,10 +10,10 @@ import argparse
 import time
 
 from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.evaluation.suites import task_facts
+from mme_vla.evaluation.results.scopes import task_facts
 
 WEIGHTS = {"easy": 0.5, "medium": 0.25, "hard": 0.25}
 
@@ -28,16 +28,16 @@ def demonstrate(task: str, difficulty: str, seed: int) -> tuple[bool, int, str]:
 
 def seeds_with_scenes(task: str, difficulty: str, first: int, count: int) -> list[int]:
     """The first seeds from `first` on whose layout finds a place for every object."""
-    found: list[int] = []
+    seeds: list[int] = []
     seed = first
-    while len(found) < count:
+    while len(seeds) < count:
         try:
             make_task(task, render=False, seed=seed, difficulty=difficulty).close()
-            found.append(seed)
+            seeds.append(seed)
         except SceneError:
             pass
         seed += 1
-    return found
+    return seeds
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""What pictures on demand save: evaluation episodes and demonstrations, drawn where looked at, against drawn whole.
+"""What images on demand save: evaluation episodes and demonstrations, drawn where looked at, against drawn whole.
 
     python benchmarks/drawing.py [MODEL ...] [--task VideoUnmask] [--steps 128] [--no-record] [--no-episodes]
 
@@ -17,10 +17,10 @@ from typing import Any
 
 from timing import machine
 
-from mme_vla.commands.record import record_episode
+from mme_vla.cli.record import record_episode
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.envs.recording.recorded import Job as Demonstration
-from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.envs.recording.outputs import Job as Demonstration
+from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
@@ -45,7 +45,7 @@ class InProcess:
     def __init__(self, **options: Any) -> None:
         self._options, self._replies = options, []  # type: ignore[var-annotated]
         self._env: ChunkEnv | None = None
-        self.pictures = {"front": 0, "wrist": 0}
+        self.images = {"front": 0, "wrist": 0}
         self.cpu_s = 0.0
 
     @property
@@ -79,7 +79,7 @@ class InProcess:
 
     def _counted(self, camera: str, capture: Callable[[], None]) -> Callable[[], None]:
         def counted() -> None:
-            self.pictures[camera] += 1
+            self.images[camera] += 1
             capture()
 
         return counted
@@ -93,7 +93,7 @@ class Measured:
     env_s: float
     """CPU seconds of the environment alone: building it, simulating and drawing."""
     wall_s: float
-    pictures: dict[str, int]
+    images: dict[str, int]
     record: EpisodeRecord
 
 
@@ -107,38 +107,38 @@ def episode(policy: MMEPolicy, name: str, job: Job, steps: int, draw: str) -> Me
     Rollout(policy, envs, facts, settings, records.append, subgoals).run([job])
     cpu, wall = time.process_time() - begun[0], time.perf_counter() - begun[1]
     envs.close()
-    return Measured(cpu, envs.cpu_s, wall, envs.pictures, records[0])
+    return Measured(cpu, envs.cpu_s, wall, envs.images, records[0])
 
 
 def episodes(models: list[str], task: str, steps: int) -> None:
     """Print a row for every model."""
-    columns = ("model", "pictures (front + wrist): all", "needed", "environment, CPU: all", "needed", "gain",
+    columns = ("model", "images (front + wrist): all", "needed", "environment, CPU: all", "needed", "gain",
                "with the policy, CPU: all", "needed", "gain", "wall, gain")  # fmt: skip
     print("| " + " | ".join(columns) + " |\n|---|" + "---:|" * (len(columns) - 1), flush=True)
     job = Job(task, "test", 0)
     for name in models:
         policy = small_policy(name)
-        whole, needed = (episode(policy, name, job, steps, draw) for draw in ("all", "needed"))
-        assert needed.record.steps == whole.record.steps > steps, "the episode ended before its limit"
-        assert whole.record.outcome == needed.record.outcome
-        assert whole.record.extra["actions_sha256"] == needed.record.extra["actions_sha256"], "other actions"
-        cells = [name, *(f"{m.pictures['front']} + {m.pictures['wrist']}" for m in (whole, needed))]
-        for a, b in ((whole.env_s, needed.env_s), (whole.cpu_s, needed.cpu_s)):
+        full, needed = (episode(policy, name, job, steps, draw) for draw in ("all", "needed"))
+        assert needed.record.steps == full.record.steps > steps, "the episode ended before its limit"
+        assert full.record.outcome == needed.record.outcome
+        assert full.record.extra["actions_sha256"] == needed.record.extra["actions_sha256"], "other actions"
+        cells = [name, *(f"{m.images['front']} + {m.images['wrist']}" for m in (full, needed))]
+        for a, b in ((full.env_s, needed.env_s), (full.cpu_s, needed.cpu_s)):
             cells += [f"{a:.1f} s", f"{b:.1f} s", f"{a / b:.1f}x"]
-        print("| " + " | ".join([*cells, f"{whole.wall_s / needed.wall_s:.1f}x"]) + " |", flush=True)
+        print("| " + " | ".join([*cells, f"{full.wall_s / needed.wall_s:.1f}x"]) + " |", flush=True)
 
 
 def demonstrations(task: str) -> None:
     """Print a row for every choice of frames."""
     print("\n| demonstration | CPU | gain | wall | gain |\n|---|---:|---:|---:|---:|", flush=True)
-    whole: list[float] = []
+    full: list[float] = []
     for name, choice in {"every frame": None, **CHOICES}.items():
         with tempfile.TemporaryDirectory() as folder:
             begun = time.process_time(), time.perf_counter()
             record_episode(Demonstration(task, 7, 3000, "easy", None, 5, choice), Path(folder))
             spent = [time.process_time() - begun[0], time.perf_counter() - begun[1]]
-        whole = whole or spent
-        cells = " | ".join(f"{now:.1f} s | {before / now:.1f}x" for before, now in zip(whole, spent, strict=True))
+        full = full or spent
+        cells = " | ".join(f"{now:.1f} s | {before / now:.1f}x" for before, now in zip(full, spent, strict=True))
         print(f"| {name} | {cells} |", flush=True)
 
 

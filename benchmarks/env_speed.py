@@ -18,8 +18,8 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 
 from mme_vla.envs import make_env, make_vec_env
-from mme_vla.envs.rendering_check import render_backend
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.envs.rendering import render_backend
 
 HOLD = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
 
@@ -39,7 +39,7 @@ def pick_cube() -> Callable[[], object]:
     return lambda: env.step(HOLD)
 
 
-def own(task: str) -> tuple[Any, Callable[[], object]]:
+def library_env(task: str) -> tuple[Any, Callable[[], object]]:
     """A task's environment, and one step of it; no conditioning video is run first."""
     env = make_env(task, seed=1, difficulty="hard", max_steps=100_000)
     env.reset(options={"video": False})
@@ -51,14 +51,14 @@ class Parts:
     """Times the parts of an environment's step: what the simulator does, and what is left to us."""
 
     def __init__(self, env: Any) -> None:
-        self.seconds = {"physics": 0.0, "rendering": 0.0, "copies of pictures": 0.0}
+        self.seconds = {"physics": 0.0, "rendering": 0.0, "copies of images": 0.0}
         scene = env.task.scene
         scene.step = self._timed("physics", scene.step)
         scene.update_render = self._timed("rendering", scene.update_render)
         for sensor in scene.sensors.values():
             sensor.capture = self._timed("rendering", sensor.capture)
             # What was drawn is waited for where it is read, so that most of the drawing's time is spent here.
-            sensor.get_obs = self._timed("copies of pictures", sensor.get_obs)
+            sensor.get_obs = self._timed("copies of images", sensor.get_obs)
 
     def _timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:
@@ -90,12 +90,12 @@ def main() -> None:
     rate(reference, 5)
     print("| task | steps/s | PickCube-v1, same run | ratio |\n|---|---:|---:|---:|")
     for task in args.tasks:
-        env, step = own(task)
+        env, step = library_env(task)
         rate(step, 3)
         pairs = [(rate(step, args.steps), rate(reference, args.steps)) for _ in range(args.rounds)]
-        ours, theirs = (float(np.median(values)) for values in zip(*pairs, strict=True))
+        target, source = (float(np.median(values)) for values in zip(*pairs, strict=True))
         env.close()
-        print(f"| {task} | {ours:.2f} | {theirs:.2f} | {np.median([a / b for a, b in pairs]):.2f} |", flush=True)
+        print(f"| {task} | {target:.2f} | {source:.2f} | {np.median([a / b for a, b in pairs]):.2f} |", flush=True)
     where(args.tasks[0], args.steps)
     for workers in args.workers:
         print(f"{workers} workers: {workers_rate(workers, args.steps):.2f} steps/s together", flush=True)
@@ -103,7 +103,7 @@ def main() -> None:
 
 def where(task: str, steps: int) -> None:
     """Print where the time of a step goes."""
-    env, step = own(task)
+    env, step = library_env(task)
     rate(step, 3)
     parts = Parts(env)
     total = 1000 / rate(step, steps)

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.envs.make import make_task
-from mme_vla.envs.metadata import SPLITS, EpisodeSpec, episode, formula
+from mme_vla.envs.metadata import SPLITS, TASK_NAMES, EpisodeSpec, episode, formula
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.task_names import TASK_NAMES
 
 MOST_TRIES = 20
 
@@ -27,14 +26,14 @@ def find_seed(task: str, split: str, index: int) -> dict[str, Any]:
     """The first seed from the formula's on with which the demonstration succeeds, and why those before it did not."""
     first, difficulty = formula(task, split, index)
     recovery = EpisodeSpec(task, split, index, first, difficulty).recovery
-    found = {"task": task, "split": split, "episode": index, "difficulty": difficulty}
+    entry = {"task": task, "split": split, "episode": index, "difficulty": difficulty}
     failures: list[str] = []
     for seed in range(first, first + MOST_TRIES):
         reason, steps = demonstrate(task, seed, difficulty, recovery)
         if reason is None:
-            return found | {"seed": seed, "steps": steps, "failures": failures}
+            return entry | {"seed": seed, "steps": steps, "failures": failures}
         failures.append(reason)
-    return found | {"seed": None, "failures": failures}
+    return entry | {"seed": None, "failures": failures}
 
 
 def demonstrate(task: str, seed: int, difficulty: str, recovery: str | None) -> tuple[str | None, int]:

@@ -1,13 +1,11 @@
-"""Damage every kind of file the library reads, and see what it says: `python benchmarks/fuzz.py [KIND…]`.
+"""Damage every kind of file that the library reads: `python benchmarks/fuzz.py [KIND…]`.
 
-For each kind a small valid artefact is made; each of `--mutations` copies of it is damaged in one way and read by the
-library's own reader in a process of its own, which has `--seconds` and `--gib` of memory beyond what it begins with.
-The same seed damages in the same ways. Exit code 1 if damage was accepted silently, or met with a traceback, a hang or
-a message of more than 2,000 characters. Nothing but temporary files is written, unless `--json` names a file.
+For each kind a small valid artefact is made. Each of `--mutations` copies of it is damaged in one way and read by the
+library's own reader in a process with limits on time and memory. The same seed damages in the same ways. Exit code 1 if
+damage was accepted without a message, or met with a traceback, a hang or a message of more than 2,000 characters.
 """
 
 import argparse
-import importlib.util
 import io
 import json
 import logging
@@ -22,24 +20,56 @@ import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for `benchmarks` itself
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))  # small files as the tests have them
 _CACHE = tempfile.TemporaryDirectory(prefix="fuzz-cache-")
 os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": _CACHE.name, "OMP_NUM_THREADS": "1"}
 
-from benchmarks.fuzz_targets.base import Target  # noqa: E402
-from benchmarks.fuzz_targets.mutations import mutate  # noqa: E402
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from helpers import artefacts
+from mme_vla import MMEPolicy
+from mme_vla.cli.weights import convert as convert_weights
+from mme_vla.errors import UserError
+from mme_vla.policy.tensor_files import WEIGHTS, save_tensors
+from mme_vla.testing.small import SMALL_VISION, small_policy
+from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
+from mme_vla.training.optim import EMA
+from mme_vla.training.settings import KeepRule
+from mme_vla.utils import SUMS, write_sums
+from mme_vla.weights import load_weights, read_stats
 
 OUTCOMES = ("refused", "warned", "harmless", "untellable", "silent", "traceback", "hang", "long")
 """Refused in words · read otherwise, with a warning · read equal · read otherwise, and no reader of this format could
 know · read otherwise without a word · another exception, or the process died · no end in time · too long a message."""
 BAD = ("silent", "traceback", "hang", "long")
 LONGEST = 2000  # characters of a message
+
+
+@dataclass(frozen=True)
+class Target:
+    """One kind of artefact.
+
+    make: writes a small valid artefact into an empty folder. read: reads all of it with the library's own reader, and
+    returns a value that is equal for equal content. untellable: the format has no checksum, so that no reader can know
+    whether another result is damage.
+    """
+
+    make: Callable[[Path], None]
+    read: Callable[[Path], object]
+    untellable: Callable[[Any, Any], bool] = lambda valid, result: False
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files that are damaged, one at a time: all but a model card."""
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "README.md")
 
 
 @dataclass(frozen=True)
@@ -54,39 +84,37 @@ class Case:
     said: str
 
 
-def targets() -> dict[str, Target]:
-    """All kinds by name; those of checkpoints lie in a module of their own."""
-    from benchmarks.fuzz_targets import data, texts
-
-    found = [*data.TARGETS, *texts.TARGETS]
-    if importlib.util.find_spec("benchmarks.fuzz_targets.checkpoints"):
-        found = [*importlib.import_module("benchmarks.fuzz_targets.checkpoints").TARGETS, *found]
-    return {target.name: target for target in found}
-
-
-def fuzz(target: Target, mutations: int, seed: int, seconds: float = 60, gib: float = 2) -> list[Case]:
+def fuzz(name: str, target: Target, mutations: int, seed: int, seconds: float = 60, gib: float = 2) -> list[Case]:
     """Damage one kind this often.
 
     Raises:
         RuntimeError: the undamaged artefact cannot be read, or does not read equal twice.
     """
-    with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
-        root = Path(name)
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as base:
+        root = Path(base)
         (root / "valid").mkdir()
         maker = multiprocessing.get_context("fork").Process(target=_make, args=(target, root / "valid"))
         maker.start()
         maker.join()
-        files = [path.relative_to(root / "valid") for path in target.files(root / "valid")]
-        (kind, valid, said), again = (_apart(target, root / "valid", seconds, gib) for _ in range(2))
+        files = [path.relative_to(root / "valid") for path in files_of(root / "valid")]
+        (kind, valid, message), again = (_apart(target, root / "valid", seconds, gib) for _ in range(2))
         if kind != "read" or again[1] != valid:
-            raise RuntimeError(f"The undamaged {target.name} cannot be read: {said or 'it reads differently twice'}")
-        return [_case(target, root, files, valid, number, seed, seconds, gib) for number in range(mutations)]
+            raise RuntimeError(f"The undamaged {name} cannot be read: {message or 'it reads differently twice'}")
+        return [_case(name, target, root, files, valid, number, seed, seconds, gib) for number in range(mutations)]
 
 
 def _case(
-    target: Target, root: Path, files: list[Path], valid: object, number: int, seed: int, seconds: float, gib: float
+    name: str,
+    target: Target,
+    root: Path,
+    files: list[Path],
+    valid: object,
+    number: int,
+    seed: int,
+    seconds: float,
+    gib: float,
 ) -> Case:
-    rng = random.Random(f"{target.name} {seed} {number}")
+    rng = random.Random(f"{name} {seed} {number}")
     work = root / f"case-{number}"
     shutil.copytree(root / "valid", work, symlinks=True)
     before = {path: (work / path).read_bytes() for path in files}
@@ -94,16 +122,16 @@ def _case(
     mutation = mutate(rng, work / path)
     if (work / path).is_file() and not (work / path).is_symlink() and (work / path).read_bytes() == before[path]:
         mutation += " (nothing changed)"
-    kind, found, said = _apart(target, work, seconds, gib)
+    kind, result, message = _apart(target, work, seconds, gib)
     outcome = kind
-    if kind == "read" and found == valid:
+    if kind == "read" and result == valid:
         outcome = "harmless"
     elif kind == "read":
-        outcome = "warned" if said else "untellable" if target.untellable(valid, found) else "silent"
-    elif kind == "refused" and len(said) > LONGEST:
+        outcome = "warned" if message else "untellable" if target.untellable(valid, result) else "silent"
+    elif kind == "refused" and len(message) > LONGEST:
         outcome = "long"
     _remove(work)
-    return Case(target.name, number, path.as_posix(), mutation, outcome, said.replace(str(work), "<folder>"))
+    return Case(name, number, path.as_posix(), mutation, outcome, message.replace(str(work), "<folder>"))
 
 
 def _apart(target: Target, folder: Path, seconds: float, gib: float) -> tuple[str, object, str]:
@@ -116,8 +144,8 @@ def _apart(target: Target, folder: Path, seconds: float, gib: float) -> tuple[st
     try:
         if not here.poll(seconds):
             return "hang", None, f"no end after {seconds:g} s"
-        answer: tuple[str, object, str] = here.recv()
-        return answer
+        reply: tuple[str, object, str] = here.recv()
+        return reply
     except EOFError:
         child.join(5)
         return "traceback", None, f"the process ended with {child.exitcode}"
@@ -142,7 +170,6 @@ def _quiet() -> None:
 
 
 def _read(target: Target, folder: Path, gib: float, answers: Connection) -> None:
-    from mme_vla.errors import UserError
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + int(gib * 2**30)
@@ -154,8 +181,8 @@ def _read(target: Target, folder: Path, gib: float, answers: Connection) -> None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             result = target.read(folder)
-        told = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
-        answers.send(("read", result, "\n".join([*told, log.getvalue()]).strip()))
+        warning_texts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+        answers.send(("read", result, "\n".join([*warning_texts, log.getvalue()]).strip()))
     except UserError as error:
         answers.send(("refused", None, str(error)))
     except BaseException:
@@ -180,9 +207,209 @@ def table(cases: Sequence[Case]) -> str:
     return "\n".join(lines)
 
 
+def mutate(rng: random.Random, path: Path) -> str:
+    """Damage a file in one way and return the way's name."""
+    ways = [
+        _flip,
+        _truncate,
+        _insert,
+        _zero,
+        _noise,
+        _replace_by_folder,
+        _replace_by_pipe,
+        _replace_by_link,
+        _remove_file,
+    ]
+    if path.suffix in (".json", ".jsonl"):
+        ways += [_change_value] * len(ways)
+    way = rng.choice(ways)
+    way(rng, path)
+    return way.__name__.strip("_")
+
+
+def _flip(rng: random.Random, path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    for _ in range(rng.choice([1, 1, 16]) if data else 0):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    path.write_bytes(data)
+
+
+def _truncate(rng: random.Random, path: Path) -> None:
+    data = path.read_bytes()
+    path.write_bytes(data[: rng.randrange(max(len(data), 1))])
+
+
+def _insert(rng: random.Random, path: Path) -> None:
+    data = path.read_bytes()
+    at = rng.randrange(len(data) + 1)
+    path.write_bytes(data[:at] + rng.randbytes(rng.randint(1, 100)) + data[at:])
+
+
+def _zero(rng: random.Random, path: Path) -> None:
+    data = path.read_bytes()
+    at = rng.randrange(max(len(data), 1))
+    path.write_bytes(data[:at] + bytes(min(512, len(data) - at)) + data[at + 512 :])
+
+
+def _noise(rng: random.Random, path: Path) -> None:
+    path.write_bytes(rng.randbytes(rng.randint(0, 4096)))
+
+
+def _replace_by_folder(rng: random.Random, path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def _replace_by_pipe(rng: random.Random, path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+def _replace_by_link(rng: random.Random, path: Path) -> None:
+    path.unlink()
+    path.symlink_to(rng.choice(["/dev/zero", "/dev/null", path.name, "nowhere", "/etc/hostname"]))
+
+
+def _remove_file(rng: random.Random, path: Path) -> None:
+    path.unlink()
+
+
+def _change_value(rng: random.Random, path: Path) -> None:
+    """Replace or delete one value of one JSON text, however deep."""
+    lines = path.read_text().rstrip("\n").split("\n") if path.suffix == ".jsonl" else [path.read_text()]
+    line = rng.randrange(len(lines))
+    root = json.loads(lines[line])
+    places: list[tuple[Any, Any]] = []
+
+    def collect(value: Any) -> None:
+        for key in list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+            places.append((value, key))
+            collect(value[key])
+
+    collect(root)
+    text = rng.choice(["null", "true", "-1", '""', "{}", '["a"]', "9" * 5001, "1e999", "NaN", "[" * 10**6, '"\\ud800"'])
+    if places:
+        box, key = rng.choice(places)
+        if rng.random() < 0.2:
+            box.pop(key)
+        else:
+            box[key] = "\u2620"
+    lines[line] = json.dumps(root).replace(json.dumps("\u2620"), text)
+    path.write_text("\n".join(lines) + "\n")
+
+
+_CONFIG = {"train": {"steps": 1}, "seed": 1}
+
+
+def _policy(model: str = "framesamp_context") -> MMEPolicy:
+    return small_policy(model, backbone={"depth": 1, "vision": {**SMALL_VISION, "patch_size": 16}})
+
+
+def _arrays(tensors: dict[str, Tensor]) -> list[object]:
+    return [value for name in sorted(tensors) for value in (name, _array(tensors[name]))]
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().to(torch.float32).cpu().numpy()
+
+
+def _of_policy(policy: MMEPolicy) -> list[object]:
+    processor = policy.require_processor()
+    stats = None if processor.stats is None else processor.stats.to_dict()
+    decisive = {key: value for key, value in policy.config.items() if key != "card"}
+    tokens = processor.prompt("pick up the red cube", state=np.zeros(8, np.float32))
+    return [*_arrays(policy.state_dict()), decisive, processor.embodiment.to_dict(), stats, *map(_array, tokens)]
+
+
+def write_sharded(folder: Path) -> None:
+    """A policy in shards, with checksums."""
+    policy = _policy()
+    policy.save_pretrained(folder)
+    (folder / WEIGHTS).unlink()
+    save_tensors(policy.state_dict(), folder, max_shard_size="200KB")
+    write_sums(folder, [file.name for file in files_of(folder) if file.name != SUMS])
+
+
+def write_without_sums(folder: Path) -> None:
+    """The same as it was written before there were checksums, or by somebody else."""
+    write_sharded(folder)
+    (folder / SUMS).unlink()
+
+
+def read_policy(folder: Path) -> object:
+    """Everything that acts: weights, statistics, prompts."""
+    return artefacts.digest(*_of_policy(MMEPolicy.from_pretrained(folder)))
+
+
+def _training() -> tuple[MMEPolicy, EMA, torch.optim.Optimizer]:
+    policy = _policy("pi05")
+    parameters: dict[str, nn.Parameter] = trainable(policy)
+    return policy, EMA(parameters, 0.9), torch.optim.AdamW(parameters.values(), 1e-3)
+
+
+def write_training(folder: Path) -> None:
+    """A training checkpoint after one update."""
+    policy, ema, optimizer = _training()
+    for parameter in policy.parameters():
+        parameter.grad = torch.full_like(parameter, 1e-3)
+    optimizer.step()
+    ema.update()
+    save_checkpoint(folder, 1, policy, ema, optimizer, _CONFIG, KeepRule())
+
+
+def read_training(folder: Path) -> object:
+    """As a resumed run reads it: the state, the processor, then weights, averages and moments."""
+    checkpoint = folder / "step_000001"
+    state = read_state(checkpoint)
+    opened = MMEPolicy.from_pretrained(checkpoint)
+    policy, ema, optimizer = _training()
+    restore(checkpoint, policy, ema, optimizer)
+    moments = [_array(value) for entry in optimizer.state_dict()["state"].values() for value in entry.values()]
+    averages = _arrays(ema.tensors())
+    return artefacts.digest(
+        state["step"], state["config"], *_of_policy(opened), *_arrays(policy.state_dict()), *averages, *moments
+    )
+
+
+def write_released(folder: Path) -> None:
+    """A run of the released JAX code (Orbax)."""
+    with tempfile.TemporaryDirectory() as place:
+        _policy("pi05").save_pretrained(Path(place) / "ours")
+        convert_weights(Path(place) / "ours", folder / "released", to="released")
+
+
+def read_released(folder: Path) -> object:
+    """Weights and statistics."""
+    policy = load_weights(_policy("pi05"), folder / "released")
+    stats = read_stats(folder / "released" / "0")
+    return artefacts.digest(*_arrays(policy.state_dict()), None if stats is None else stats.to_dict())
+
+
+def _always(valid: object, result: object) -> bool:
+    return True
+
+
+TARGETS = {
+    "checkpoint": Target(write_sharded, read_policy),
+    "training-checkpoint": Target(write_training, read_training),
+    "checkpoint-without-sums": Target(write_without_sums, read_policy, _always),
+    "released-checkpoint": Target(write_released, read_released, _always),
+    "cache": Target(artefacts.write_cache, artefacts.read_cache),
+    "dataset": Target(artefacts.write_summed_dataset, artefacts.read_dataset),
+    "dataset-without-sums": Target(artefacts.write_dataset, artefacts.read_dataset, _always),
+    "hdf5": Target(artefacts.write_recording, artefacts.read_recording, _always),
+    "logs": Target(artefacts.write_logs, artefacts.read_logs, artefacts.is_shorter),
+    "kept-answers": Target(artefacts.write_answers, artefacts.read_answers),
+    "answers": Target(artefacts.write_replies, artefacts.read_replies, _always),
+    "rows": Target(artefacts.write_rows, artefacts.read_rows),
+    "metadata": Target(artefacts.write_metadata, artefacts.read_metadata, _always),
+}
+"""Kind of file → how to make one and how the library reads it."""
+
+
 def main(words: Sequence[str] | None = None) -> int:
     """Run from the command line; return the exit code."""
-    known = targets()
+    known = TARGETS
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default: all of {', '.join(known)}")
     parser.add_argument("--mutations", type=int, default=200, help="of each kind (default 200)")
@@ -196,7 +423,7 @@ def main(words: Sequence[str] | None = None) -> int:
     cases: list[Case] = []
     for name in args.kinds or known:
         started = time.monotonic()
-        cases += fuzz(known[name], args.mutations, args.seed, args.seconds, args.gib)
+        cases += fuzz(name, known[name], args.mutations, args.seed, args.seconds, args.gib)
         print(f"{name}: {time.monotonic() - started:.0f} s", file=sys.stderr, flush=True)
     print(table(cases))
     bad = [case for case in cases if case.outcome in BAD]

@@ -30,9 +30,7 @@ from timing import machine
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from mme_vla.backbone.layers.attention import attend, look
-from mme_vla.backbone.layers.blocks import Span
-from mme_vla.backbone.layers.sight import Sight
+from mme_vla.backbone.attention import MaskLayout, Span, attend, build_mask
 from mme_vla.integration.base import MEMORY_VISIBILITY
 
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0
@@ -47,7 +45,7 @@ def chunks(model: str, setup: Setup) -> dict[str, Any]:
     noise = draws_of(policy, 1, device)["noise"]
     with torch.no_grad(), policy.autocast():
         memory = policy.encode_memory(batch.history)
-    found: dict[str, Any] = {}
+    rows: dict[str, Any] = {}
     reference: Tensor | None = None
 
     def measure(way: str) -> None:
@@ -55,7 +53,7 @@ def chunks(model: str, setup: Setup) -> dict[str, Any]:
         took = milliseconds(lambda: policy.sample_actions(batch, noise, memory=memory), setup.rounds, 3, device)
         chunk = policy.sample_actions(batch, noise, memory=memory).float()
         reference = chunk if reference is None else reference
-        found[way] = {
+        rows[way] = {
             "p50_ms": statistics.median(took),
             "p99_ms": took[min(int(0.99 * len(took)), len(took) - 1)],
             "difference": float((chunk - reference).abs().max()),
@@ -74,59 +72,61 @@ def chunks(model: str, setup: Setup) -> dict[str, Any]:
             measure("compiled graph")
         else:
             measure("compiled")
-    return found
+    return rows
 
 
 def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), width: int = 256) -> dict[str, Any]:
-    """Attention alone, with memory, pictures, prompt and actions so long: each backend's time and error."""
+    """Attention alone, with memory, images, prompt and actions so long: each backend's time and error."""
     spans = [Span(name, length) for name, length in zip(MEMORY_VISIBILITY, lengths, strict=True)]
-    found: dict[str, Any] = {}
+    rows: dict[str, Any] = {}
     for backend in ("sdpa", "flex", "varlen"):
         if backend == "flex" and setup.device.type != "cuda":
-            found[backend] = NOT_MEASURED  # it has no backward pass there
+            rows[backend] = NOT_MEASURED  # it has no backward pass there
             continue
-        sight, tensors, exact = _attention_case(spans, setup, width)
-        seen = look(sight, setup.dtype, backend, compiled=False)
+        mask_layout, tensors, exact = _attention_case(spans, setup, width)
+        mask = build_mask(mask_layout, setup.dtype, backend, compiled=False)
 
-        def both(tensors: list[Tensor] = tensors, seen: Any = seen) -> Tensor:
+        def both(tensors: list[Tensor] = tensors, mask: Any = mask) -> Tensor:
             for x in tensors:
                 x.grad = None
-            answer = attend(*tensors, seen)
-            answer.sum().backward()
-            return answer
+            output = attend(*tensors, mask)
+            output.sum().backward()
+            return output
 
-        answer = both().detach()
-        found[backend] = {
+        output = both().detach()
+        rows[backend] = {
             "ms": statistics.median(milliseconds(both, setup.rounds, 2, setup.device)),
-            "error": float((answer.float() - exact).abs().max()),
+            "error": float((output.float() - exact).abs().max()),
         }
-    return found
+    return rows
 
 
-def _attention_case(spans: Sequence[Span], setup: Setup, width: int) -> tuple[Sight, list[Tensor], Tensor]:
+def _attention_case(spans: Sequence[Span], setup: Setup, width: int) -> tuple[MaskLayout, list[Tensor], Tensor]:
     n = sum(span.length for span in spans)
     generator = torch.Generator().manual_seed(n)
     valid = (torch.rand(setup.batch, n, generator=generator) < 0.8).to(setup.device)
-    sight = Sight.of(spans, spans, valid, MEMORY_VISIBILITY)
+    mask_layout = MaskLayout.of(spans, spans, valid, MEMORY_VISIBILITY)
     sizes = [(setup.batch, n, heads, width) for heads in (8, 1, 1)]
-    drawn = [torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes]
-    q, k, v = (x.float().transpose(1, 2) for x in drawn)
-    logits = (q @ k.transpose(-1, -2) * width**-0.5).masked_fill(~sight.spread(sight.seen)[:, None], -torch.inf)
+    sampled = [torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes]
+    q, k, v = (x.float().transpose(1, 2) for x in sampled)
+    logits = (q @ k.transpose(-1, -2) * width**-0.5).masked_fill(
+        ~mask_layout.expand(mask_layout.visible)[:, None], -torch.inf
+    )
     exact = (logits.softmax(-1) @ v).transpose(1, 2).flatten(2)
-    return sight, [x.requires_grad_() for x in drawn], exact
+    return mask_layout, [x.requires_grad_() for x in sampled], exact
 
 
 def nan_sweep(setup: Setup, lengths: Sequence[int], width: int = 256) -> list[str]:
     """Where an answer or a gradient is no number: backend and number of keys."""
     broken = []
-    for pictures in lengths:
-        spans = [Span("memory", 64), Span("images", pictures), Span("prompt", 48), Span("action", 16)]
+    for n_images in lengths:
+        spans = [Span("memory", 64), Span("images", n_images), Span("prompt", 48), Span("action", 16)]
         for backend in ("sdpa", "varlen") if setup.device.type != "cuda" else ("sdpa", "flex", "varlen"):
-            sight, tensors, _ = _attention_case(spans, setup, width)
-            answer = attend(*tensors, look(sight, setup.dtype, backend, compiled=False))
-            functional.mse_loss(answer, torch.zeros_like(answer)).backward()
-            if not all(torch.isfinite(x).all() for x in (answer, *(x.grad for x in tensors if x.grad is not None))):
-                broken.append(f"{backend} at {64 + pictures + 48 + 16} keys")
+            mask_layout, tensors, _ = _attention_case(spans, setup, width)
+            output = attend(*tensors, build_mask(mask_layout, setup.dtype, backend, compiled=False))
+            functional.mse_loss(output, torch.zeros_like(output)).backward()
+            if not all(torch.isfinite(x).all() for x in (output, *(x.grad for x in tensors if x.grad is not None))):
+                broken.append(f"{backend} at {64 + n_images + 48 + 16} keys")
     return broken
 
 
@@ -163,8 +163,8 @@ def show(result: dict[str, Any]) -> None:
         print(f"LeRobot's PI05: update {update['ms']:.1f} ms, {update['samples_per_s']:.1f} samples/s, peak {gib}")
         _show_chunks(result["lerobot"]["chunk"])
     for backend, row in result["attention"].items():
-        told = row if isinstance(row, str) else f"{row['ms']:.2f} ms forward and backward, error {row['error']:.1e}"
-        print(f"attention, {backend}: {told}")
+        text = row if isinstance(row, str) else f"{row['ms']:.2f} ms forward and backward, error {row['error']:.1e}"
+        print(f"attention, {backend}: {text}")
     print("NaN sweep:", ", ".join(result["nan"]) or "none")
 
 
@@ -205,12 +205,12 @@ def alone(models: Sequence[str], setup: Setup, workers: int, lerobot: bool) -> d
 
 def together(models: Sequence[str], setup: Setup) -> dict[str, Any]:
     """An update over all processes, of each model and each way to share it."""
-    found: dict[str, Any] = {}
+    rows: dict[str, Any] = {}
     for model in models:
         for strategy in ("ddp", "fsdp"):
-            found[f"{model}, {strategy}"] = training(model, setup, strategy)
+            rows[f"{model}, {strategy}"] = training(model, setup, strategy)
             gc.collect()
-    return found
+    return rows
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -226,27 +226,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--eager", action="store_true", help="compile no layers")
     parser.add_argument("--no-lerobot", action="store_true", help="leave LeRobot's PI05 out")
     parser.add_argument("--output", type=Path, help="a JSON file; one that is there is gone on with")
-    given = parser.parse_args(arguments)
-    device, rank, processes = join_processes(given.device)
-    setup = Setup(given.backbone, given.batch, given.rounds, device, not given.eager, given.attention, processes)
+    args = parser.parse_args(arguments)
+    device, rank, processes = join_processes(args.device)
+    setup = Setup(args.backbone, args.batch, args.rounds, device, not args.eager, args.attention, processes)
     result: dict[str, Any] = {}
-    if given.output is not None and given.output.exists():
-        result = json.loads(given.output.read_text())
+    if args.output is not None and args.output.exists():
+        result = json.loads(args.output.read_text())
     failures = []
     if processes == 1:
-        result |= alone(given.models, setup, given.workers, not given.no_lerobot)
+        result |= alone(args.models, setup, args.workers, not args.no_lerobot)
         show(result)
         failures = judge(result)
     else:
-        found = together(given.models, setup)
-        result.setdefault("processes", {})[str(processes)] = found
-        failures = [f"{who}: a loss is no number" for who, row in found.items() if not row["finite"]]
+        rows = together(args.models, setup)
+        result.setdefault("processes", {})[str(processes)] = rows
+        failures = [f"{who}: a loss is no number" for who, row in rows.items() if not row["finite"]]
         if rank == 0:
-            for who, row in found.items():
+            for who, row in rows.items():
                 print(_of_update(f"{who}, {processes} processes", row), flush=True)
         distributed.destroy_process_group()
-    if given.output is not None and rank == 0:
-        given.output.write_text(json.dumps(result, indent=2) + "\n")
+    if args.output is not None and rank == 0:
+        args.output.write_text(json.dumps(result, indent=2) + "\n")
     for failure in failures if rank == 0 else ():
         print("BELOW THE GOAL:", failure)
     return int(bool(failures))

@@ -1,4 +1,4 @@
-"""The row of `gpu.py` about LeRobot's PI05 as shipped: the same pictures, prompt and chunk, its own code."""
+"""The row of `gpu.py` about LeRobot's PI05 as shipped: the same images, prompt and chunk, its own code."""
 
 import statistics
 from typing import Any
@@ -22,25 +22,25 @@ def lerobot_row(setup: Setup) -> dict[str, Any]:
     """
     device, b = setup.device, setup.batch
     full = setup.backbone == "pi05"
-    theirs = lerobot_pi05("bfloat16" if device.type == "cuda" else "float32", reduced=not full).to(device)
+    source = lerobot_pi05("bfloat16" if device.type == "cuda" else "float32", reduced=not full).to(device)
     time = torch.full((b,), 0.5, device=device)
 
     def inputs(rows: int) -> tuple[Any, ...]:
-        pictures = list(torch.rand(2, rows, 3, 224, 224, device=device) * 2 - 1)
-        seen = [torch.ones(rows, dtype=torch.bool, device=device)] * 2
+        images = list(torch.rand(2, rows, 3, 224, 224, device=device) * 2 - 1)
+        masks = [torch.ones(rows, dtype=torch.bool, device=device)] * 2
         tokens = torch.full((rows, PROMPT), 5, device=device)
-        return pictures, seen, tokens, torch.ones(rows, PROMPT, dtype=torch.bool, device=device)
+        return images, masks, tokens, torch.ones(rows, PROMPT, dtype=torch.bool, device=device)
 
-    given, (actions, noise) = inputs(b), torch.randn(2, b, HORIZON, 32, device=device).unbind(0)
+    batch, (actions, noise) = inputs(b), torch.randn(2, b, HORIZON, 32, device=device).unbind(0)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    step = trainer(theirs, lambda: theirs.forward(*given, actions, noise, time).mean())
+    step = trainer(source, lambda: source.forward(*batch, actions, noise, time).mean())
     took = statistics.median(milliseconds(step, setup.rounds, 3, device))
     row = {"ms": took, "samples_per_s": 1e3 * b / took, "peak_gib": peak_gib(device)}
     alone, noise = inputs(1), noise[:1]
-    theirs.eval()
+    source.eval()
     with torch.no_grad():
         chunk = milliseconds(
-            lambda: theirs.sample_actions(*alone, noise=noise, num_steps=STEPS), setup.rounds, 2, device
+            lambda: source.sample_actions(*alone, noise=noise, num_steps=STEPS), setup.rounds, 2, device
         )
     return {"training": row, "chunk": {"eager": {"p50_ms": statistics.median(chunk), "p99_ms": chunk[-1]}}}

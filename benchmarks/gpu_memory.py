@@ -6,7 +6,7 @@
     python benchmarks/gpu_memory.py shared pi05:4:16:all                   # … :recomputation (all, selective)
 
 One process a figure, one line of JSON. Weights hold whatever was in memory: nothing is learned, only counted. It asks
-for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as docs/hardware.md has it; `shared` is one of
+for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as docs/evidence has it; `shared` is one of
 so many processes of one machine, and speaks to nobody.
 """
 
@@ -26,8 +26,7 @@ from mme_vla import MMEPolicy, build_policy
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.training import parallel
 from mme_vla.training.checkpoint import trainable
-from mme_vla.training.ema import EMA
-from mme_vla.training.optim import clip_gradients, make_optimizer
+from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
 from mme_vla.training.settings import TrainSettings
 from mme_vla.types import Batch
 
@@ -88,12 +87,12 @@ def shared(
     policy.train().recompute(recompute == "all" or recompute or False)  # type: ignore[arg-type]
     mesh = parallel.ParallelSettings("fsdp").mesh("cuda")
     # Nobody has weights to send: what comes after the sharding is left out.
-    whole, parallel.set_model_state_dict = parallel.set_model_state_dict, lambda *_, **__: None
+    original, parallel.set_model_state_dict = parallel.set_model_state_dict, lambda *_, **__: None
     rank, distributed.get_rank = distributed.get_rank, lambda *_: 1
     try:
         parallel.shard(policy, mesh, policy.compute_dtype)
     finally:
-        parallel.set_model_state_dict, distributed.get_rank = whole, rank
+        parallel.set_model_state_dict, distributed.get_rank = original, rank
     return _updates(policy, samples, partial(parallel.reshard, policy))
 
 
@@ -102,8 +101,8 @@ def _updates(policy: MMEPolicy, samples: int, reshard: Callable[[], None]) -> di
     optimizer = make_optimizer(learning.values(), TrainSettings(steps=10, batch_size=samples, lr=1e-4))
     ema = EMA(learning, 0.999, reshard=reshard)
     batch = batch_of(policy, samples)
-    draws = {name: value.to(DEVICE) for name, value in policy.loss_draws(samples, torch.Generator()).items()}
-    held = torch.cuda.memory_allocated()
+    draws = {name: value.to(DEVICE) for name, value in policy.training_noise(samples, torch.Generator()).items()}
+    allocated = torch.cuda.memory_allocated()
     for _ in range(3):  # moments come with the first
         torch.cuda.reset_peak_memory_stats()
         policy(batch, draws)[0].backward()
@@ -111,7 +110,7 @@ def _updates(policy: MMEPolicy, samples: int, reshard: Callable[[], None]) -> di
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         ema.update(0)
-    return {"held before": held / GIB, **_peaks()}
+    return {"held before": allocated / GIB, **_peaks()}
 
 
 def _peaks() -> dict[str, float]:
@@ -127,21 +126,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--mode", default="full", help="of `shared`: finetune (full, expert_only, lora)")
     parser.add_argument("--frozen-dtype", help="of `shared`: finetune.frozen_dtype")
     parser.add_argument("--no-cudnn", action="store_true", help="leave cuDNN out: a stand-in has none")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     if not torch.cuda.is_available():
         parser.error("there is no GPU, nor one that computes nothing")
-    torch.backends.cudnn.enabled = not given.no_cudnn
-    model, *numbers = given.of.split(":")
-    if given.what == "chunk":
-        found = chunk(model, given.backbone)
-    elif given.what == "update":
-        found = update(model, int(numbers[0]), given.backbone)
+    torch.backends.cudnn.enabled = not args.no_cudnn
+    model, *numbers = args.of.split(":")
+    if args.what == "chunk":
+        peaks = chunk(model, args.backbone)
+    elif args.what == "update":
+        peaks = update(model, int(numbers[0]), args.backbone)
     else:
-        found = shared(
-            model, int(numbers[0]), int(numbers[1]), *numbers[2:3], backbone=given.backbone, mode=given.mode,
-            frozen_dtype=given.frozen_dtype,
+        peaks = shared(
+            model, int(numbers[0]), int(numbers[1]), *numbers[2:3], backbone=args.backbone, mode=args.mode,
+            frozen_dtype=args.frozen_dtype,
         )  # fmt: skip
-    print(json.dumps({"what": given.what, "of": given.of, **{name: round(gib, 2) for name, gib in found.items()}}))
+    print(json.dumps({"what": args.what, "of": args.of, **{name: round(gib, 2) for name, gib in peaks.items()}}))
     return 0
 
 

@@ -12,7 +12,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla import MMEPolicy, build_policy
 from mme_vla.evaluation.analyses.cost import flops
-from mme_vla.evaluation.analyses.meta_shapes import RememberedShapes
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.types import Batch
 
@@ -68,7 +67,7 @@ def peak_gib(device: torch.device) -> float | None:
 
 def milliseconds(work: Callable[[], object], rounds: int, warmup: int, device: torch.device) -> list[float]:
     """How long each round takes, the device's work included; ascending. A CPU is warmed up once at most."""
-    found = []
+    times = []
     warmup = warmup if device.type == "cuda" else min(warmup, 1)
     for index in range(warmup + rounds):
         wait(device)
@@ -76,8 +75,8 @@ def milliseconds(work: Callable[[], object], rounds: int, warmup: int, device: t
         work()
         wait(device)
         if index >= warmup:
-            found.append(1e3 * (time.perf_counter() - begun))
-    return sorted(found)
+            times.append(1e3 * (time.perf_counter() - begun))
+    return sorted(times)
 
 
 def wait(device: torch.device) -> None:
@@ -94,7 +93,7 @@ def sample_flops(model: str, backbone: str) -> tuple[int, int]:
     """
     policy = built(model, backbone, torch.device("meta"))
     batch = policy.full_batch("meta")
-    with RememberedShapes(), FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False) as counter:
         policy(batch, draws_of(policy, 1, torch.device("meta")))[0].backward()
     computed = counter.get_total_flops()
     again = 0
@@ -111,7 +110,7 @@ def built(model: str, backbone: str, device: torch.device, attention: str = "aut
         options["policy.compute_dtype"] = "bfloat16"
     policy = build_policy(model, backbone=backbone, device=device, **options)
     assert isinstance(policy, MMEPolicy)
-    policy.backbone.choose_attention(attention)
+    policy.backbone.set_attention_backend(attention)
     policy.backbone.vision.requires_grad_(False)
     return policy.train()
 
@@ -127,5 +126,5 @@ def batch_of(policy: MMEPolicy, size: int, device: torch.device) -> Batch:
 
 def draws_of(policy: MMEPolicy, size: int, device: torch.device) -> dict[str, Tensor]:
     """Random numbers of its loss."""
-    drawn = policy.loss_draws(size, torch.Generator().manual_seed(0))
-    return {name: value.to(device) for name, value in drawn.items()}
+    sampled = policy.training_noise(size, torch.Generator().manual_seed(0))
+    return {name: value.to(device) for name, value in sampled.items()}

@@ -15,8 +15,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 
 from mme_vla import MMEPolicy
-from mme_vla.training.ema import EMA
-from mme_vla.training.optim import clip_gradients, make_optimizer
+from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
 from mme_vla.training.parallel import ParallelSettings, reshard, shard
 from mme_vla.training.settings import TrainSettings
 from mme_vla.types import Batch
@@ -88,9 +87,9 @@ def feeding(model: str, setup: Setup, workers: int) -> dict[str, float]:
         wait(device)
         waited, begun = 0.0, time.perf_counter()
         for _ in range(setup.rounds):
-            asked = time.perf_counter()
+            request_time = time.perf_counter()
             batch = next(batches)
-            waited += time.perf_counter() - asked
+            waited += time.perf_counter() - request_time
             update(batch.to(device, non_blocking=True), draws)
         wait(device)
         took = time.perf_counter() - begun
@@ -100,10 +99,10 @@ def feeding(model: str, setup: Setup, workers: int) -> dict[str, float]:
 
 def _batches(policy: MMEPolicy, setup: Setup, workers: int, caches: Path) -> Iterator[Batch]:
     """Batches of the embedded demonstrations in random order, without end."""
-    from mme_vla.data.cache.ensure import ensure_cache
+    from mme_vla.data.cache_building import ensure_cache
     from mme_vla.data.dataset import TrainingDataset
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.data.layout import SAMPLE
+    from mme_vla.data.lerobot_files import SAMPLE
     from mme_vla.data.statistics import compute_norm_stats
 
     source, processor = EpisodeSource(SAMPLE), policy.require_processor()

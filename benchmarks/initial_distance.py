@@ -16,14 +16,14 @@ from mme_vla.testing.small import NEURAL, random_batch, random_history, small_po
 @torch.no_grad()
 def distance(name: str, **overrides: object) -> float:
     """Mean of |v_memory − v_plain| / |v_plain|."""
-    plain, remembering = small_policy("pi05"), small_policy(name, **overrides)
-    remembering.load_state_dict(plain.state_dict(), strict=False)
+    baseline, remembering = small_policy("pi05"), small_policy(name, **overrides)
+    remembering.load_state_dict(baseline.state_dict(), strict=False)
     distances = []
     for seed in range(8):
-        batch = random_batch(plain, seed=seed)
+        batch = random_batch(baseline, seed=seed)
         noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(seed))
         time = torch.full((len(noise),), 0.5)
-        before = plain.velocity(batch, noise, time)
+        before = baseline.velocity(batch, noise, time)
         batch.history = random_history(remembering, len(noise), remembering.memory.budget, seed)
         after = remembering.velocity(batch, noise, time)
         distances.append(float((after - before).norm() / before.norm()))

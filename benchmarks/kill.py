@@ -1,44 +1,77 @@
-"""Commands killed (SIGKILL) before every change they make to a file, then repeated with the same words.
+"""Kill commands (SIGKILL) before changes they make to files, then repeat them with the same words.
 
-    python benchmarks/kill.py [train cache convert record evaluate] [--every 1] [--only rename …] [--minutes 60]
+    python benchmarks/kill.py [train cache convert evaluate record] [--every 1] [--times 5]
 
-What comes out must equal an undisturbed run's result bit by bit, but for times. `kill_tracer.py` says what is seen of a
-process; `kill_commands.py` what is run: small models, made-up demonstrations, a scripted environment, the made-up
-simulator of one process. Nothing leaves the machine.
+The results must equal those of an undisturbed run bit by bit, apart from times. Each run is a fresh process. Python's
+audit events tell when it opens a file for writing, renames, removes or makes a folder: it is killed before every
+`--every`-th of these, and `--times` times after a random part of its duration, while libraries write their files.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import random
+import re
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from functools import partial
-from importlib import import_module
-from itertools import groupby
 from pathlib import Path
 
-os.environ |= {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1"}
-sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent / "tests")]
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPOSITORY / "tests"))  # small files as the tests have them
 
-from kill_commands import COMMANDS, Command, results  # noqa: E402
-from kill_tracer import trace  # noqa: E402
+SMALL = (
+    "model=tokendrop_expert backbone.depth=1 backbone.vision.depth=1 backbone.vision.image_size=32 "
+    "backbone.vision.patch_size=2 memory.budget=64"
+)
+RECIPE = (
+    "train.steps=3 train.save_every=1 train.log_every=1 train.val_every=2 train.val_samples=1 train.batch_size=1 "
+    "train.open_loop_chunks=1 train.device=cpu train.workers=0 train.keep.last=1 logger=none"
+)
+COMMANDS = {
+    "train": f"train {SMALL} {RECIPE} data.cache.root=cache output=out/run resume=auto",
+    "cache": f"cache {SMALL} data.cache.root=out device=cpu",
+    "convert": "convert input=recordings output=out/dataset",
+    "evaluate": "evaluate model=pi05 backbone=tiny tasks=[StopCube] episodes=2 max_steps=2 workers=1 render=false "
+                "flow_steps=1 seed=7 output=out/run",
+    "record": "record task=[StopCube,PickXtimes] episodes=1 frames=[0] workers=1 output=out/dataset hdf5=out/files",
+}  # fmt: skip
+"""Words after `mme-vla`, run in a folder with the inputs `cache` and `recordings`. Results are below `out`."""
+
+RUN = """
+import os, runpy, signal, sys
+below, kill_at, log = os.path.join(os.getcwd(), "out"), int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_CREAT)
+main, count = os.getpid(), 0
+CHANGES = {"os.rename": 1, "os.remove": 0, "os.mkdir": 0, "os.rmdir": 0, "os.link": 1, "os.symlink": 1}
+def watch(event, args):
+    global count
+    if event == "open":
+        path = args[0] if args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT) else None
+    else:
+        path = args[CHANGES[event]] if event in CHANGES else None
+    if isinstance(path, (str, bytes, os.PathLike)) and os.getpid() == main:
+        path = os.path.abspath(os.fsdecode(path))
+        if path.startswith(below):
+            count += 1
+            os.write(log, f"{event} {path[len(below) + 1:]}\\n".encode())
+            if count == kill_at:
+                os.kill(main, signal.SIGKILL)
+sys.addaudithook(watch)
+sys.argv = ["mme_vla", *sys.argv[3:]]
+runpy.run_module("mme_vla", run_name="__main__", alter_sys=True)
+"""
+# What only tells when and how fast, and the checksums of lines that do.
+TIMES = re.compile(r'"(?:seconds|when|begun|speed/\w+|memory/gib|crc32)": ?(?:"[^"]*"|\{[^}]*\}|[-+.\w]+)')
 
 
 @dataclass
 class Outcome:
-    """What came of killing one command.
-
-    changes: file operations of an undisturbed run. kills: how many of them it was killed before.
-    refused: kills after which the same words failed. wrong: after which the results differ.
-    left: after which something lies beside them. outlived: after which a process of the command lived on.
-    places: what was about to be done in all of these.
-    """
+    """Kills of one command: after how many it failed, ended with other results, or left other files behind."""
 
     command: str
     changes: int = 0
@@ -46,151 +79,98 @@ class Outcome:
     refused: int = 0
     wrong: int = 0
     left: int = 0
-    outlived: int = 0
-    seconds: float = 0.0
     places: list[str] = field(default_factory=list)
 
-    @property
-    def failures(self) -> int:
-        return self.refused + self.wrong + self.outlived
+
+def results(folder: Path) -> dict[str, str]:
+    """A hash of every file below a folder, without what only tells the time."""
+    sums = {}
+    for path in sorted(file for file in folder.rglob("*") if file.is_file()):
+        data = path.read_bytes()
+        if path.suffix in (".json", ".jsonl"):
+            data = TIMES.sub("", data.decode()).encode()
+        if "events.out" not in path.name:
+            sums[path.relative_to(folder).as_posix()] = hashlib.sha256(data).hexdigest()
+    return sums
 
 
-def attack(
-    name: str,
-    every: int,
-    base: Path,
-    until: float = float("inf"),
-    first: int = 1,
-    only: Sequence[str] = (),
-    thin: bool = False,
-    skip: int = 0,
-) -> Outcome:
-    """Kill a command before every so manieth of its changes from number `first` on, each time in a new folder.
-
-    Args:
-        only: kinds of change to kill before, such as `rename`; empty: all.
-        thin: of successive writes to one file take the first, the middle and the last one alone.
-        skip: leave out so many, which an earlier attack had time for.
-    """
-    command, begun, found = COMMANDS[name], time.monotonic(), Outcome(name)
-    inputs, log = base / f"{name}-inputs", base / f"{name}.log"
-    inputs.mkdir()
-    folder = base / name  # the same for all runs: some results say where they lie
-    _import_what_it_uses(command, inputs, folder, log)
-    expected, changes = _run(command.run, inputs, folder, log)
-    found.changes = len(changes)
-    chosen = _ends_and_middles(changes) if thin else range(1, len(changes) + 1)
-    numbers = [n for n in chosen if n >= first and (not only or changes[n - 1].split()[0] in only)]
-    numbers = numbers[::every]
-    random.Random(0).shuffle(numbers)  # so that what there is time for is spread over the run
-    for number in numbers[skip:]:
-        if time.monotonic() > until:
-            break
-        folder.mkdir()
-        work = partial(_quiet, partial(command.run, inputs, folder), log)
-        killed = trace(work, folder, kill_at=number)
-        again = trace(work, folder)
-        there = results(folder)
-        found.kills += killed.code == -9
-        found.outlived += killed.outlived > 0
-        found.refused += again.code != 0
-        found.wrong += again.code == 0 and any(there.get(path) != value for path, value in expected.items())
-        found.left += bool(there.keys() - expected.keys())
-        if again.code or any(there.get(path) != value for path, value in expected.items()) or killed.outlived:
-            wrong = sorted(path for path, value in expected.items() if there.get(path) != value)
-            found.places.append(f"{number} {killed.changes[-1]}: exit {again.code}, {wrong[:4]}")
-        elif extra := sorted(there.keys() - expected.keys()):
-            found.places.append(f"{number} {killed.changes[-1]}: left {extra[:4]}")
-        shutil.rmtree(folder)
-    found.seconds = round(time.monotonic() - begun, 1)
-    return found
+def run(words: str, base: Path, kill_at: int = 0, after: float | None = None) -> tuple[int, list[str], str]:
+    """Exit code, changes and errors of a command; it is killed before a change, or after so many seconds."""
+    log = base / "changes.log"
+    log.unlink(missing_ok=True)
+    path = os.pathsep.join([str(REPOSITORY), *sys.path[:1]])
+    variables = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "PYTHONHASHSEED": "0"}
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", RUN, str(kill_at), str(log), *words.split()], cwd=base, env=variables,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    try:
+        _, errors = process.communicate(timeout=600 if after is None else after)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        _, errors = process.communicate()
+    return process.returncode, log.read_text().splitlines() if log.exists() else [], errors
 
 
-def _ends_and_middles(changes: Sequence[str]) -> list[int]:
-    """Numbers (from 1) of all changes, but of successive equal ones (writes to one file) of three alone.
-
-    A Parquet file of a few hundred columns is some 550 writes, and what a kill leaves differs in its length only.
-    """
-    numbers: list[int] = []
-    for _, group in groupby(range(1, len(changes) + 1), key=lambda n: changes[n - 1]):
-        same = list(group)
-        numbers += sorted({same[0], same[len(same) // 2], same[-1]})
-    return numbers
-
-
-def _import_what_it_uses(command: Command, inputs: Path, folder: Path, log: Path) -> None:
-    """Prepare the inputs and run the command once, elsewhere, and import here what it imported.
-
-    Forked processes then need not, and this one has neither threads nor drawn numbers of a run.
-    """
-    modules = log.with_suffix(".modules")
-
-    def rehearse() -> None:
-        command.prepare(inputs)
-        folder.mkdir()
-        command.run(inputs, folder)
-        modules.write_text("\n".join(sys.modules))
-
-    _finish(partial(_quiet, rehearse, log), folder, log)
-    shutil.rmtree(folder)
-    for name in modules.read_text().split("\n"):
-        with suppress(Exception):  # some register modules that cannot be imported by their name
-            import_module(name)
-
-
-def _run(
-    run: Callable[[Path, Path], object], inputs: Path, folder: Path, log: Path
-) -> tuple[dict[str, str], Sequence[str]]:
-    folder.mkdir()
-    changes = _finish(partial(_quiet, partial(run, inputs, folder), log), folder, log)
-    found = results(folder)
-    shutil.rmtree(folder)
-    return found, changes
-
-
-def _finish(work: Callable[[], object], folder: Path, log: Path) -> Sequence[str]:
-    done = trace(work, folder, limit_s=300)
-    if done.code:
-        raise RuntimeError(f"an undisturbed run ended with {done.code}:\n{log.read_text()[-3000:]}")
-    return done.changes
-
-
-def _quiet(work: Callable[[], object], log: Path) -> None:
-    with log.open("w") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    work()
+def attack(name: str, every: int, times: int, base: Path) -> Outcome:
+    """Kill a command in each way, and compare what its repetition writes with an undisturbed run."""
+    words, outcome, out = COMMANDS[name], Outcome(name), base / "out"
+    begun = time.monotonic()
+    code, changes, errors = run(words, base)
+    duration = time.monotonic() - begun
+    if code:
+        raise RuntimeError(f"an undisturbed run of {name} ended with {code}:\n{errors[-3000:]}")
+    expected, outcome.changes = results(out), len(changes)
+    rng = random.Random(0)
+    ways = [{"kill_at": number} for number in range(every, len(changes) + 1, every)]
+    ways += [{"after": duration * rng.uniform(0.3, 1)} for _ in range(times)]  # type: ignore[misc]
+    for way in ways:
+        shutil.rmtree(out, ignore_errors=True)
+        killed, seen, _ = run(words, base, **way)  # type: ignore[arg-type]
+        outcome.kills += killed == -signal.SIGKILL
+        again, _, errors = run(words, base)
+        files = results(out)
+        wrong = sorted(path for path, value in expected.items() if files.get(path) != value)
+        left = sorted(files.keys() - expected.keys())
+        outcome.refused += again != 0
+        outcome.wrong += again == 0 and bool(wrong)
+        outcome.left += again == 0 and bool(left)
+        if again or wrong or left:
+            last = seen[-1] if seen else "no change"
+            outcome.places.append(
+                f"{way} at {last}: exit {again}, {wrong[:4]}, {left[:4]} {errors[-300:] * bool(again)}"
+            )
+    shutil.rmtree(out, ignore_errors=True)
+    return outcome
 
 
 def main() -> None:
     """Run the attacks and print their table."""
     parser = argparse.ArgumentParser("python benchmarks/kill.py", description=__doc__.splitlines()[0])
     parser.add_argument("commands", nargs="*", default=list(COMMANDS), help=f"of {', '.join(COMMANDS)}; default: all")
-    parser.add_argument("--every", type=int, default=1, help="kill before every so manieth operation (default: each)")
-    parser.add_argument("--first", type=int, default=1, help="number of the first operation to kill before")
-    parser.add_argument("--only", nargs="+", default=(), help="kinds of operation, such as rename (default: all)")
-    parser.add_argument("--thin", action="store_true", help="three of the successive writes to one file, not all")
-    parser.add_argument("--minutes", type=float, default=60, help="stop killing after so long (default: 60)")
-    parser.add_argument("--skip", type=int, default=0, help="go on after so many kills of an earlier attack")
+    parser.add_argument("--every", type=int, default=1, help="kill before every so manieth change (default: each)")
+    parser.add_argument("--times", type=int, default=5, help="kills after a random part of the duration (default: 5)")
     parser.add_argument("--json", type=Path, help="write the outcomes here")
-    given = parser.parse_args()
-    if unknown := set(given.commands) - set(COMMANDS):
+    args = parser.parse_args()
+    if unknown := set(args.commands) - set(COMMANDS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
-    until, outcomes = time.monotonic() + 60 * given.minutes, []
-    print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |")
-    print("|---|" + "---:|" * 7)
-    with tempfile.TemporaryDirectory() as base:
-        for name in given.commands:
-            o = attack(name, given.every, Path(base).resolve(), until, given.first, given.only, given.thin, given.skip)
+    from helpers.h5_files import write_file
+
+    outcomes = []
+    print("| command | changes | kills | refused | wrong | left behind |\n|---|" + "---:|" * 5)
+    with tempfile.TemporaryDirectory() as folder:
+        base = Path(folder).resolve()
+        (base / "recordings").mkdir()
+        write_file(base / "recordings" / "record_dataset_Alpha.h5", [6, 5], videos=[2, 0], size=64)
+        write_file(base / "recordings" / "record_dataset_Beta.h5", [4], size=64)
+        for name in args.commands:
+            o = attack(name, args.every, args.times, base)
             outcomes.append(o)
-            numbers = (o.changes, o.kills, o.refused, o.wrong, o.left, o.outlived, o.seconds)
-            print(f"| {name} | " + " | ".join(map(str, numbers)) + " |", flush=True)
-    for o in outcomes:
-        for place in o.places:
-            print(f"{o.command}: {place}")
-    if given.json:
-        given.json.write_text(json.dumps([asdict(o) for o in outcomes], indent=2) + "\n")
-    raise SystemExit(any(o.failures for o in outcomes))
+            print(f"| {name} | {o.changes} | {o.kills} | {o.refused} | {o.wrong} | {o.left} |", flush=True)
+    print("\n".join(f"{o.command}: {place}" for o in outcomes for place in o.places))
+    if args.json:
+        args.json.write_text(json.dumps([asdict(o) for o in outcomes], indent=2) + "\n")
+    raise SystemExit(any(o.refused or o.wrong for o in outcomes))
 
 
 if __name__ == "__main__":

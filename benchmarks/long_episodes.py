@@ -24,13 +24,13 @@ LAST = 7  # decisions that a median is of
 
 def decisions(policy: MMEPolicy, frames: int, prepare: bool) -> list[tuple[float, float, float]]:
     """CPU seconds of taking, deciding and preparing, one row a decision."""
-    pictures = moving_frames(STRIDE)
+    images = moving_frames(STRIDE)
     states = np.zeros((STRIDE, 8), np.float32)
     episode, rows = policy.start_episode("press the button"), []
     for start in range(0, frames, STRIDE):
         clock = [time.process_time()]
-        shown = np.roll(pictures, start // STRIDE, axis=1)  # frames differ over the episode
-        episode.observe({"front": shown, "wrist": shown}, states)
+        shifted = np.roll(images, start // STRIDE, axis=1)  # frames differ over the episode
+        episode.observe({"front": shifted, "wrist": shifted}, states)
         clock.append(time.process_time())
         policy.act(episode)
         clock.append(time.process_time())
@@ -47,13 +47,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--models", nargs="+", default=["tokendrop_modul", "ttt_modul", "rmt_modul"])
     parser.add_argument("--frames", nargs="+", type=int, default=[80, 560, 1064, 1300])
     parser.add_argument("--no-prepare", action="store_true", help="leave everything to the decision itself")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     print(f"{machine()}; ms of CPU time: frames taken / decision / prepared for the next\n")
-    print("| model | " + " | ".join(f"{n:,} frames" for n in given.frames) + " |\n|---|" + "---:|" * len(given.frames))
-    for model in given.models:
-        rows = decisions(small_policy(model), max(given.frames), not given.no_prepare)
+    print("| model | " + " | ".join(f"{n:,} frames" for n in args.frames) + " |\n|---|" + "---:|" * len(args.frames))
+    for model in args.models:
+        rows = decisions(small_policy(model), max(args.frames), not args.no_prepare)
         cells = []
-        for frames in given.frames:
+        for frames in args.frames:
             last = rows[max(frames // STRIDE - LAST, 0) : frames // STRIDE]
             took = (1e3 * statistics.median(part) for part in zip(*last, strict=True))
             cells.append(" / ".join(f"{ms:.0f}" for ms in took))

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 from timing import machine
 
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.envs.vector.pool import VecEnv
+from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
@@ -78,7 +77,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2, help="of the batched contestant")
     parser.add_argument("--steps", type=int, default=64, help="step limit of an episode")
     parser.add_argument("--episodes", type=int, default=1, help="of each of the four tasks")
-    parser.add_argument("--no-render", action="store_true", help="black pictures: the simulation alone")
+    parser.add_argument("--no-render", action="store_true", help="black images: the simulation alone")
     args = parser.parse_args()
     policy = small_policy(args.model)
     jobs = [Job(task, "test", episode) for episode in range(args.episodes) for task in TASKS]

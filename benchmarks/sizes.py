@@ -60,11 +60,11 @@ def main() -> None:
 def of_recipe(words: Sequence[str]) -> str:
     """The line of a recipe: parameters without its adapters, and what its own fine-tuning keeps while training."""
     cfg = compose("train", list(words))
-    chosen: Any = OmegaConf.to_container(cfg.finetune, resolve=True)
+    options: Any = OmegaConf.to_container(cfg.finetune, resolve=True)
     policy = build_from_config(cfg, device="meta")
     total = sum(p.numel() for p in policy.parameters())
     with torch.device("meta"):
-        apply_finetuning(policy, chosen.pop("mode"), **chosen)
+        apply_finetuning(policy, options.pop("mode"), **options)
     copies = 4 + (cfg.train.ema > 0)
     learning = [p.numel() for p in policy.parameters() if p.requires_grad]
     still = [p for p in policy.parameters() if not p.requires_grad]

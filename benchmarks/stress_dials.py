@@ -1,6 +1,6 @@
 """How far each dial of `split=stress` goes: who knows everything, does it still solve the test scenes?
 
-`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (goes on where it was stopped)
+`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (continues where it was stopped)
 
 Two know everything. The demonstrator moves the arm as it records. The oracle planner is `mme_vla.play`'s: it acts from
 outside, as a policy in an evaluation does, by choices and pixels, and has so many control steps after the video.
@@ -14,9 +14,9 @@ from pathlib import Path
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import DIALS
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.variants import DIALS
 from mme_vla.play import OraclePlayer
 from mme_vla.play.game import MAX_CHOICES, EpisodeId
 from mme_vla.play.players import play
@@ -36,7 +36,7 @@ type Ended = tuple[str, int, int]
 
 
 def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
-    """A demonstration without pictures."""
+    """A demonstration without images."""
     spec = metadata.episode(task, "test", episode)
     env = make_task(task, render=False, seed=spec.seed, difficulty=spec.difficulty, stress={dial: value})
     try:
@@ -47,10 +47,10 @@ def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
 
 
 def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
-    """The oracle planner's choices in the environment that policies meet, without pictures."""
+    """The oracle planner's choices in the environment that policies meet, without images."""
     spec = metadata.episode(task, f"stress:{dial}={value}", episode)
     which = EpisodeId(*astuple(spec))
-    session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, pictures=False)
+    session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, images=False)
     try:
         play(session, OraclePlayer())
         video = len(session.reveals[0].frames) - 1
@@ -82,7 +82,7 @@ def main() -> None:
     if there:
         with args.output.open() as file:
             done = {tuple(row[name] for name in KEY) for row in csv.DictReader(file)}
-    wanted = [
+    keys = [
         (actor, dial, task, value, episode)
         for actor in args.actors
         for dial in args.dials
@@ -94,7 +94,7 @@ def main() -> None:
         writer = csv.writer(file)
         if not there:
             writer.writerow(COLUMNS)
-        for key in wanted:
+        for key in keys:
             if tuple(map(str, key)) not in done:
                 writer.writerow(measure(*key))
                 file.flush()

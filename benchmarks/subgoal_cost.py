@@ -5,9 +5,9 @@
 Plays the execution of demonstrations of the embedded sample through the real predictors, 16 steps at a time, with
 stand-ins for the models: they give the recorded subgoals (and MemER's keyframes) as answers, and count. Qwen3-VL-4B's
 FLOPs are those of PyTorch's `FlopCounterMode` over the real code on the meta device: vision tower, one pass over the
-question with keys and values kept, one pass for each token of the answer. Tokens of pictures are exact; words are
+question with keys and values kept, one pass for each token of the answer. Tokens of images are exact; words are
 counted with a small tokenizer of RoboMME's language, where Qwen's own would take about as many. Gemini's FLOPs are not
-known; its tokens of pictures are what its documentation says (258 a picture and 258 a second of video), its thoughts
+known; its tokens of images are what its documentation says (258 an image and 258 a second of video), its thoughts
 are left out, and its price is that of configs/subgoal/gemini.yaml.
 """
 
@@ -24,13 +24,12 @@ from mme_vla.evaluation.analyses.cost import count_model, flops
 from mme_vla.subgoal import Gemini, Memer, QwenVL
 from mme_vla.subgoal.finetuning.collecting import Demonstration, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes
-from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
-from mme_vla.subgoal.words.parsing import mark_points, write_boxes
-from mme_vla.subgoal.words.prompts import memer_answer
+from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
+from mme_vla.subgoal.text import mark_points, memer_reply, write_boxes
 
 TERA = 1e12
 RUN = 16  # actions executed of a chunk
-PICTURE, SECOND = 258, 258  # Gemini's tokens of a picture, and of a second of video
+IMAGE_TOKENS, SECOND = 258, 258  # Gemini's tokens of an image, and of a second of video
 QWEN3_VL_4B = {
     "text_config": {
         "vocab_size": 151936, "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36,
@@ -58,13 +57,13 @@ def qwen() -> Any:
 
 
 @cache
-def vision_flops(patches: int, pictures: int) -> int:
-    """The vision tower and its mergers on pictures of this many patches each, attention within each."""
+def vision_flops(patches: int, n_images: int) -> int:
+    """The vision tower and its mergers on images of this many patches each, attention within each."""
     tower = qwen().model.visual
-    total = patches * pictures
+    total = patches * n_images
     pixels = torch.empty(total, 3 * 2 * 16 * 16, device="meta")
     angles = torch.empty(total, 64, device="meta")
-    bounds = torch.arange(pictures + 1) * patches  # on the CPU: the attention splits by their values
+    bounds = torch.arange(n_images + 1) * patches  # on the CPU: the attention splits by their values
 
     def run() -> None:
         hidden = tower.patch_embed(pixels)
@@ -78,12 +77,12 @@ def vision_flops(patches: int, pictures: int) -> int:
 
 
 @cache
-def language_flops(read: int, written: int) -> int:
-    """The language model on `read` tokens, then on `written` tokens one after the other."""
+def language_flops(read: int, n_output: int) -> int:
+    """The language model on `read` tokens, then on `n_output` tokens one after the other."""
     from transformers import DynamicCache
 
     model, width = qwen(), QWEN3_VL_4B["text_config"]["hidden_size"]
-    kept = DynamicCache(config=model.config.get_text_config())
+    cache = DynamicCache(config=model.config.get_text_config())
 
     def step(tokens: int, first: int) -> int:
         positions = torch.arange(first, first + tokens, device="meta").expand(3, 1, -1)
@@ -92,53 +91,53 @@ def language_flops(read: int, written: int) -> int:
             out = model.model.language_model(
                 inputs_embeds=torch.empty(1, tokens, width, device="meta"),
                 position_ids=positions,
-                past_key_values=kept,
+                past_key_values=cache,
                 use_cache=True,
             )
             model.lm_head(out.last_hidden_state[:, -1:])
 
         return flops(run)
 
-    return step(read, 0) + max(written - 1, 0) * step(1, read)  # the pass over the question gives the first token
+    return step(read, 0) + max(n_output - 1, 0) * step(1, read)  # the pass over the question gives the first token
 
 
 class CountingVLM:
     """Stands in for a `VLM`: gives the answers it is told, and counts FLOPs of Qwen3-VL-4B for each question."""
 
     def __init__(self, tiny: VLM) -> None:
-        self.tiny, self.next_answer, self.flops = tiny, "", 0
+        self.tiny, self.next_reply, self.flops = tiny, "", 0
 
-    def generate(self, questions: Sequence[Question], max_new_tokens: int) -> list[Answer]:
+    def generate(self, questions: Sequence[Question], max_new_tokens: int) -> list[Completion]:
         (question,) = questions
         batch = self.tiny.encode([question])
         read = batch["input_ids"].shape[1]
-        written = len(self.tiny.processor.tokenizer.encode(self.next_answer)) + 1
+        n_output = len(self.tiny.processor.tokenizer.encode(self.next_reply)) + 1
         for grid in ("image_grid_thw", "video_grid_thw"):
             for time, height, width in batch.get(grid, torch.zeros(0, 3, dtype=torch.long)).tolist():
                 self.flops += vision_flops(height * width, time)
-        self.flops += language_flops(-(-read // 16) * 16, written)
-        return [Answer(self.next_answer, read, written)]
+        self.flops += language_flops(-(-read // 16) * 16, n_output)
+        return [Completion(self.next_reply, read, n_output)]
 
 
 class CountingClient:
     """Stands in for google-genai's client."""
 
     def __init__(self, tokenizer: Any) -> None:
-        self.tokenizer, self.next_answer, self.models = tokenizer, "", self
+        self.tokenizer, self.next_reply, self.models = tokenizer, "", self
         self.frames: dict[int, int] = {}
 
     def generate_content(self, *, model: str, contents: list[Any], config: dict[str, Any]) -> Any:
         read = len(self.tokenizer.encode(config["system_instruction"]))
-        for part in (part for turn in contents for part in turn["parts"]):
+        for part in (part for message in contents for part in message["parts"]):
             if "text" in part:
                 read += len(self.tokenizer.encode(part["text"]))
             else:
                 video = part["inline_data"]["mime_type"] == "video/mp4"
-                read += SECOND * max(1, round(seconds(part["inline_data"]["data"]))) if video else PICTURE
-        written = len(self.tokenizer.encode(self.next_answer))
+                read += SECOND * max(1, round(seconds(part["inline_data"]["data"]))) if video else IMAGE_TOKENS
+        n_output = len(self.tokenizer.encode(self.next_reply))
         return SimpleNamespace(
-            text=self.next_answer,
-            usage_metadata=SimpleNamespace(prompt_token_count=read, candidates_token_count=written),
+            text=self.next_reply,
+            usage_metadata=SimpleNamespace(prompt_token_count=read, candidates_token_count=n_output),
             candidates=[],
         )
 
@@ -169,28 +168,28 @@ def play(predictor: Any, labels: Labels, say: Callable[[int], None]) -> int:
     return chunks
 
 
-def answer(name: str, kind: str, labels: Labels, step: int) -> str:
+def expected_reply(name: str, kind: str, labels: Labels, step: int) -> str:
     """What the model says at a step: the recorded subgoal, in the predictor's form."""
     text = write_boxes(*mark_points(labels.texts(kind)[step]))
     if name == "gemini":
         return f'{{"description": "the robot moved on", "subgoal": "{text}"}}'
     if name != "memer":
         return text
-    shown = [step] if step == labels.exec_start else list(range(step - 14, step + 1, 2))
-    wanted = keyframes(labels)
-    return memer_answer(text, [i for i, t in enumerate(shown, 1) if any(0 <= t - k <= 1 for k in wanted)])
+    displayed = [step] if step == labels.exec_start else list(range(step - 14, step + 1, 2))
+    targets = keyframes(labels)
+    return memer_reply(text, [i for i, t in enumerate(displayed, 1) if any(0 <= t - k <= 1 for k in targets)])
 
 
 def measure(
-    name: str, kind: str, policy: str, predictor: Any, model: Any, episodes: Sequence[Labels], plain: int
+    name: str, kind: str, policy: str, predictor: Any, model: Any, episodes: Sequence[Labels], baseline: int
 ) -> list[str]:
     """Play these episodes; the cells of one row, means over them."""
     chunks = 0
     for labels in episodes:
-        told = partial(answer, name, kind, labels)
-        chunks += play(predictor, labels, lambda step, told=told: setattr(model, "next_answer", told(step)))
+        reply_at = partial(expected_reply, name, kind, labels)
+        chunks += play(predictor, labels, lambda step, reply_at=reply_at: setattr(model, "next_reply", reply_at(step)))
     n, usage = len(episodes), predictor.usage
-    acting, reference = chunks * count_model(policy).chunk, chunks * plain
+    acting, reference = chunks * count_model(policy).chunk, chunks * baseline
     counted = isinstance(model, CountingVLM)
     return [
         f"`{name}`, {kind}", f"`{policy}`", f"{chunks / n:.1f}", f"{usage.calls / n:.1f}",
@@ -206,7 +205,7 @@ def count(demonstrations: Sequence[Demonstration]) -> None:
     """Print the table."""
     tiny = VLM.load("tiny", device="cpu")
     episodes = [demonstration.labels() for demonstration in demonstrations]
-    plain = count_model("pi05").chunk  # refuses a PyTorch whose counter leaves out attention
+    baseline = count_model("pi05").chunk  # refuses a PyTorch whose counter leaves out attention
     heads = [
         "predictor", "policy", "chunks", "calls", "tokens read a call", "written a call", "a call",
         "predictor, an episode", "policy, an episode", "together, over `pi05`",
@@ -221,7 +220,7 @@ def count(demonstrations: Sequence[Demonstration]) -> None:
         ("gemini", "grounded", "groundsg", Gemini("grounded", client=client, requests_per_minute=None), client),
     ]
     for case in cases:
-        print(f"| {' | '.join(measure(*case, episodes, plain))} |", flush=True)
+        print(f"| {' | '.join(measure(*case, episodes, baseline))} |", flush=True)
 
 
 def main() -> None:

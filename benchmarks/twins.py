@@ -9,12 +9,12 @@ import numpy as np
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.task_names import TASK_NAMES
 
 
 def demonstrate(task: str, episode: int, in_view: bool) -> tuple[bool, np.ndarray]:
-    """Whether a demonstration without pictures succeeds, and its joint states [t, 7]."""
+    """Whether a demonstration without images succeeds, and its joint states [t, 7]."""
     spec = metadata.episode(task, "test", episode)
     env = make_task(task, render=False, seed=spec.seed, difficulty=spec.difficulty, in_view=in_view)
     try:

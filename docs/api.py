@@ -86,7 +86,7 @@ def page() -> str:
     """The whole page.
 
     Raises:
-        ValueError: a public name stands in no group.
+        ValueError: a public name is in no group.
     """
     named = {name for names in GROUPS.values() for name in names}
     known = {name for name in mme_vla.__all__ if name != "__version__"}

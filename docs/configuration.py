@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mme_vla.config.comments import COMMANDS, heading, keys
+from mme_vla.cli.help import COMMANDS, heading, keys
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS, PAGE = ROOT / "configs", ROOT / "docs" / "configuration.md"
@@ -19,8 +19,8 @@ the same words are keyword arguments: `build_policy("framesamp_modul", backbone=
 
 
 def prose(text: str) -> str:
-    """Text of a comment as Markdown: what stands in angle brackets is no tag, a bar is no column."""
-    pieces = text.split("`")  # every second one stands in backticks, where only a bar means anything
+    """Text of a comment as Markdown: what is in angle brackets is no tag, a bar is no column."""
+    pieces = text.split("`")  # every second one is in backticks, where only a bar means anything
     for i, piece in enumerate(pieces):
         bare = piece if i % 2 else piece.replace("<", "&lt;").replace(">", "&gt;").replace("*", r"\*")
         pieces[i] = bare.replace("|", r"\|")

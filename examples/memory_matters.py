@@ -1,4 +1,4 @@
-"""Does the memory work? A stream whose answer was visible only in the conditioning video.
+"""Does the memory work? A stream whose target was visible only in the conditioning video.
 
     python examples/memory_matters.py                         # every neural variant and pi05, two at a time
     python examples/memory_matters.py framesamp_modul --seconds 60
@@ -9,14 +9,14 @@ action depends on its colour alone. The current view, the goal and the state say
 only guess: `pi05` is always trained beside what is named. Prints the open-loop error of each policy on episodes it has
 not seen, and draws it.
 
-The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp look at every 4th
-frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and
+The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp read every 4th
+frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot reads every token and
 every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
 takes in, and what all slots have in common is learned late.
 
-The memories beyond the paper can be named too (`retrieval_modul`); what they change stands in `OF_KIND`. In the video
+The memories beyond the paper can be named too (`retrieval_modul`); what they change is in `OF_KIND`. In the video
 the arm leans aside, for each colour its own way: that is all that the memory `actions` is told, and `spacetime` beside
-its pictures.
+its images.
 """
 
 import argparse
@@ -32,11 +32,12 @@ import numpy as np
 import torch
 
 from mme_vla import build_policy
-from mme_vla.config.composition import compose, print_user_errors
-from mme_vla.memory.base import stack_history
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.config.composition import compose
+from mme_vla.memory.base import past_view_spec, stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.past_views import past_views, stack_past
+from mme_vla.processing.images import past_views, stack_past
 from mme_vla.testing.small import ALL_BEYOND, NEURAL, cached_history
 from mme_vla.types import Batch, PastViews
 
@@ -109,18 +110,20 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
 
 
 def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generator, size: int) -> Batch:
-    """Random execution steps of random episodes, with the action their colour asks for."""
+    """Random execution steps of random episodes, with the action of their colour."""
     processor, config = policy.require_processor(), policy.backbone.config
-    chosen = [streams[i] for i in rng.integers(len(streams), size=size)]
+    selected = [streams[i] for i in rng.integers(len(streams), size=size)]
     steps = rng.integers(VIDEO, LENGTH, size=size)
-    views = np.stack([stream.frames[t] for stream, t in zip(chosen, steps, strict=True)])
+    views = np.stack([stream.frames[t] for stream, t in zip(selected, steps, strict=True)])
     prompt, prompt_mask = processor.prompt("do what the video showed")
     actions = torch.zeros(size, config.horizon, config.action_dim)
-    actions[..., :8] = torch.from_numpy(ANSWERS[[stream.colour for stream in chosen]])[:, None]
+    actions[..., :8] = torch.from_numpy(ANSWERS[[stream.colour for stream in selected]])[:, None]
     history = None
     if policy.memory is not None:
         memory = policy.memory
-        recalled = [memory.recall(s.history, int(t)) for s, t in zip(chosen, steps, strict=True) if s.history]
+        recalled = [
+            memory.gather_selection(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history
+        ]
         history = stack_history(recalled)
     return Batch(
         images=processor.images([views, views])[:, :1],  # one camera says it all
@@ -129,19 +132,19 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
         prompt_mask=prompt_mask.expand(size, -1),
         history=history,
         actions=actions,
-        past=past_of(policy, chosen, steps),
+        past=past_of(policy, selected, steps),
     ).without_prompt_padding()
 
 
-def past_of(policy: MMEPolicy, chosen: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
+def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
     """Past views of the one camera, where the memory gives the vision tower any."""
-    look = None if policy.memory is None else policy.memory.looks_back
-    if look is None:
+    past_spec = past_view_spec(policy.memory)
+    if past_spec is None:
         return None
     prepare = policy.require_processor().images
     past = stack_past([
-        past_views(look, int(t), lambda at, stream=stream: [stream.frames[at]] * 2, prepare)
-        for stream, t in zip(chosen, steps, strict=True)
+        past_views(past_spec, int(t), lambda at, stream=stream: [stream.frames[at]] * 2, prepare)
+        for stream, t in zip(selected, steps, strict=True)
     ])  # fmt: skip
     assert past is not None
     return replace(past, images=past.images[:, :, :1])
@@ -169,12 +172,12 @@ def learn(
     every: int = 100,
     enough: float = 0.08,
 ) -> dict[str, Any]:
-    """Train one policy until it answers for the episodes it trains on; its error on others, and what it took.
+    """Train one policy until it fits the episodes it trains on; its error on others, and what it took.
 
     Args:
         seconds: most CPU time, encoding included. steps: most updates. episodes: to learn from.
         backbone: keys of the tiny backbone to change. config_dir: YAML files of your own.
-        every: updates between two looks at the error on what it trains on. enough: error that it stops at.
+        every: updates between two measurements of the error on what it trains on. enough: error that it stops at.
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)
@@ -184,7 +187,7 @@ def learn(
         model, seed=seed, config_dir=config_dir, policy={"augment": False}, backbone=backbone or {}, **options
     )
     policy.backbone.vision.requires_grad_(False)
-    seen, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
+    train_streams, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
     trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=lr, betas=(0.9, 0.95), fused=True)
     rng, done = np.random.default_rng(seed), 0
@@ -192,14 +195,14 @@ def learn(
         policy.train()
         for group in optimizer.param_groups:
             group["lr"] = lr * min(1.0, (done + 1) / 30)
-        loss, _ = policy(make_batch(policy, seen, rng, batch_size))
+        loss, _ = policy(make_batch(policy, train_streams, rng, batch_size))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         done += 1
         if done % every == 0 and policy.memory is not None:
-            error = open_loop_error(policy, seen, 24)
+            error = open_loop_error(policy, train_streams, 24)
             print(f"  {model}: {error:.2f} on the episodes it learns from after {done} steps", flush=True)
             if error < enough:
                 break
@@ -267,9 +270,9 @@ def compare(args: argparse.Namespace) -> None:
                 with args.results.open("a") as file:
                     file.write(json.dumps(result) + "\n")
     line = "{model:20} error {error:.3f} after {steps} steps, {cpu:.0f} s of CPU time, {wall:.0f} s of wall time"
-    shown = [results[model] for model in models]
-    print("\n".join(line.format(**result) for result in shown))
-    plot(shown, args.plot)
+    displayed = [results[model] for model in models]
+    print("\n".join(line.format(**result) for result in displayed))
+    plot(displayed, args.plot)
     print(f"plot: {args.plot}")
 
 

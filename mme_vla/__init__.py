@@ -14,17 +14,17 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
     from mme_vla.envs.vector.pool import make_vec_env
     from mme_vla.errors import UserError
-    from mme_vla.evaluation.from_python import evaluate
-    from mme_vla.evaluation.probe.calling import probe
+    from mme_vla.evaluation.api import evaluate
     from mme_vla.integration.base import Integration
     from mme_vla.memory.base import Memory
+    from mme_vla.memory.encoder import PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
-    from mme_vla.memory.perceptual import PerceptualMemory
     from mme_vla.memory.recurrent import RecurrentMemory
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.episode import Episode
     from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.probing.run import probe
     from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, SUBGOALS, TASKS, register
     from mme_vla.subgoal.base import SubgoalPredictor
     from mme_vla.types import Batch, HistoryTokens, MemoryTokens
@@ -40,7 +40,7 @@ _HOME = {
     "MMEPolicy": "mme_vla.policy.mme",
     "Episode": "mme_vla.policy.episode",
     "Memory": "mme_vla.memory.base",
-    "PerceptualMemory": "mme_vla.memory.perceptual",
+    "PerceptualMemory": "mme_vla.memory.encoder",
     "RecurrentMemory": "mme_vla.memory.recurrent",
     "StorageSpec": "mme_vla.memory.history",
     "History": "mme_vla.memory.history",
@@ -55,8 +55,8 @@ _HOME = {
     "Batch": "mme_vla.types",
     "make_env": "mme_vla.envs.make",
     "make_vec_env": "mme_vla.envs.vector.pool",
-    "evaluate": "mme_vla.evaluation.from_python",
-    "probe": "mme_vla.evaluation.probe.calling",
+    "evaluate": "mme_vla.evaluation.api",
+    "probe": "mme_vla.probing.run",
     "load_weights": "mme_vla.weights.load",
     "register": "mme_vla.registry",
     "UserError": "mme_vla.errors",

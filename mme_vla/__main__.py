@@ -2,8 +2,8 @@
 
 import sys
 
-from mme_vla.commands import COMMANDS, run
-from mme_vla.config.endings import print_user_errors
+from mme_vla.cli import COMMANDS, run
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.errors import did_you_mean
 
 

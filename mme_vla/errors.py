@@ -30,7 +30,7 @@ def missing_extra(what: str, extra: str) -> UserError:
 
 
 def brief(value: object, most: int = 80, quote: bool = True) -> str:
-    """A value as it stands in a message: its repr, cut in the middle where it is longer than `most` characters.
+    """A value as it is in a message: its repr, cut in the middle where it is longer than `most` characters.
 
     >>> brief("x" * 1000, 9)
     "'xxx…xxx'"
@@ -62,5 +62,5 @@ def listed(names: Iterable[object], most: int = 12) -> str:
     'a, b and 1 more'
     """
     every = [brief(str(name), 120, quote=False) for name in names]
-    rest = len(every) - most
-    return ", ".join(every[:most]) + (f" and {rest:,} more" if rest > 0 else "")
+    remaining = len(every) - most
+    return ", ".join(every[:most]) + (f" and {remaining:,} more" if remaining > 0 else "")

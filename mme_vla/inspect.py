@@ -1,6 +1,6 @@
-"""`python -m mme_vla.inspect`: the command is mme_vla/commands/inspect.py."""
+"""`python -m mme_vla.inspect`: the command is mme_vla/cli/inspect.py."""
 
-from mme_vla.commands import run
+from mme_vla.cli import run
 
 if __name__ == "__main__":
     run("inspect")

@@ -1,6 +1,6 @@
-"""`python -m mme_vla.probe`: the command is mme_vla/commands/probe.py."""
+"""`python -m mme_vla.probe`: the command is mme_vla/cli/probe.py."""
 
-from mme_vla.commands import run
+from mme_vla.cli import run
 
 if __name__ == "__main__":
     run("probe")

@@ -1,4 +1,4 @@
-"""Name → class tables. A decorator registers; a Hydra config names the key."""
+"""Name → class tables. A decorator registers; a configuration names the key."""
 
 import importlib
 import inspect
@@ -30,11 +30,7 @@ class Registry[T]:
         self._shipped = dict(shipped or {})
 
     def register(self, name: str) -> Callable[[Any], Any]:
-        """Return a decorator that files a class or function under `name`.
-
-        Raises:
-            UserError: another object already has this name.
-        """
+        """Return a decorator that files a class or function under `name`."""
 
         def decorate(entry: Any) -> Any:
             taken = self._entries.get(name)
@@ -61,9 +57,6 @@ class Registry[T]:
 
         Args:
             section: `name`, and the options. args, fixed: what the caller adds; no option may say the same.
-
-        Raises:
-            UserError: no name, an unknown one, an option the constructor does not take, or one that is missing.
         """
         options = {key: value for key, value in section.items() if key != "name"}
         if not isinstance(section.get("name"), str):
@@ -77,12 +70,12 @@ class Registry[T]:
             signature.bind(*args, **fixed, **options)
         except TypeError as error:
             kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-            own = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
-            takes = own[len(args) :]
+            accepted = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
+            takes = accepted[len(args) :]
             unknown = [name for name in options if name not in takes]
             hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
-            given = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
-            raise UserError(f"{what} does not take these options: {given} ({error}). {hint}") from None
+            options_text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
+            raise UserError(f"{what} does not take these options: {options_text} ({error}). {hint}") from None
         return entry(*args, **fixed, **options)
 
     def __contains__(self, name: object) -> bool:
@@ -92,32 +85,55 @@ class Registry[T]:
         return iter(sorted({*self._entries, *self._shipped}))
 
 
-MEMORIES: Registry[Any] = Registry("memory")
-INTEGRATIONS: Registry[Any] = Registry("integration")
-BACKBONES: Registry[Any] = Registry(
-    "backbone", {name: f"mme_vla.backbone.{name}.backbone" for name in ("pi05", "openvla", "nano")}
+MEMORIES: Registry[Any] = Registry(
+    "memory",
+    {
+        **{name: f"mme_vla.memory.{name}" for name in ("framesamp", "tokendrop", "ttt", "rmt", "joined")},
+        **{
+            name: f"mme_vla.memory.extensions.{name}"
+            for name in ("actions", "bank", "gist", "learned_topk", "moment", "retrieval", "spacetime")
+        },
+    },
 )
+INTEGRATIONS: Registry[Any] = Registry(
+    "integration", {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "expert", "film")}
+)
+BACKBONES: Registry[Any] = Registry(
+    "backbone",
+    {
+        "pi05": "mme_vla.backbone.pi05",
+        "nano": "mme_vla.backbone.nano",
+        "openvla": "mme_vla.methods.openvla_oft.model",
+    },
+)
+HEADS: Registry[Any] = Registry("flow head", dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"))
 POLICIES: Registry[Any] = Registry(
     "policy",
     {
         "mme": "mme_vla.policy.mme",
-        "diffusion_policy": "mme_vla.policy.diffusion.policy",
-        "sam2act_plus": "mme_vla.policy.sam2act.waypoint_policy",
-        "openvla": "mme_vla.policy.openvla",
-        "memoryvla": "mme_vla.policy.memoryvla.policy",
+        "diffusion_policy": "mme_vla.methods.diffusion_policy.policy",
+        "sam2act_plus": "mme_vla.methods.sam2act.policy",
+        "openvla": "mme_vla.methods.openvla_oft.policy",
+        "memoryvla": "mme_vla.methods.memoryvla.policy",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
     "processor",
     {
         "pi05": "mme_vla.processing.processor",
-        "diffusion_policy": "mme_vla.policy.diffusion.processing",
-        "sam2act_plus": "mme_vla.policy.sam2act.cloud_processing",
-        "openvla": "mme_vla.processing.openvla",
-        "memoryvla": "mme_vla.policy.memoryvla.processing",
+        "diffusion_policy": "mme_vla.methods.diffusion_policy.processor",
+        "sam2act_plus": "mme_vla.methods.sam2act.processor",
+        "openvla": "mme_vla.methods.openvla_oft.processor",
+        "memoryvla": "mme_vla.methods.memoryvla.processor",
     },
 )
-SUBGOALS: Registry[Any] = Registry("subgoal predictor")
+SUBGOALS: Registry[Any] = Registry(
+    "subgoal predictor",
+    {
+        **{name: f"mme_vla.subgoal.{name}" for name in ("oracle", "qwenvl", "memer", "gemini", "notebook")},
+        "openai": "mme_vla.subgoal.gemini",
+    },
+)
 TASKS: Registry[Any] = Registry("task")
 PLAYERS: Registry[Any] = Registry(
     "player",
@@ -128,7 +144,7 @@ PLAYERS: Registry[Any] = Registry(
 )
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REGISTRIES = {
-    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "policy": POLICIES,
+    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
     "intervention": INTERVENTIONS,
 }  # fmt: skip
@@ -138,8 +154,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     """Return a decorator that files a part of one's own under `name`, for YAML files and command lines to call it by.
 
     Args:
-        kind: `memory`, `integration`, `backbone`, `policy`, `processor`, `subgoal` (a predictor), `task`,
-            `player` or `intervention` (of a probe).
+        kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
+            `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
 
     Raises:
         UserError: an unknown kind, or the name is taken.

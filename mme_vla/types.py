@@ -5,10 +5,11 @@ One legend for shapes, used in the whole library:
 b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l prompt length
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,20 +19,40 @@ def send(x: Tensor, device: torch.device) -> Tensor:
     return x.pin_memory().to(device, non_blocking=True) if device.type == "cuda" and not x.is_cuda else x.to(device)
 
 
+Noise = dict[str, Tensor]
+"""Random numbers by name, one row a sample. The caller makes them, so that batching and sharding cannot change them."""
+
+
+def named_noise(noise: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> Noise:
+    """Noise by name; a bare tensor is a flow's `noise`."""
+    named = {"noise": noise} if isinstance(noise, Tensor) else dict(noise or {})
+    return named | {name: value for name, value in more.items() if value is not None}
+
+
+def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Noise:
+    """Noise of single samples (`sampling_noise`) as that of a batch."""
+    return {name: torch.stack([row[name] for row in rows]).to(device) for name in (rows[0] if rows else {})}
+
+
+def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -> Noise:
+    """Every value through `change`: rows of a batch, another device."""
+    return {name: change(value) for name, value in noise.items()}
+
+
 class TensorStruct:
     """A dataclass of tensors (or nested structs, or None) that moves between devices as one."""
 
     def _map(self, fn: Any) -> Self:
-        moved = {}
+        values = {}
         for member in fields(self):  # type: ignore[arg-type]
             value = getattr(self, member.name)
             if isinstance(value, Tensor):
-                moved[member.name] = fn(value)
+                values[member.name] = fn(value)
             elif isinstance(value, TensorStruct):
-                moved[member.name] = value._map(fn)
+                values[member.name] = value._map(fn)
             else:
-                moved[member.name] = value
-        return type(self)(**moved)
+                values[member.name] = value
+        return type(self)(**values)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """Return a copy whose tensors went through `Tensor.to` with these arguments."""
@@ -41,9 +62,9 @@ class TensorStruct:
         """Return a copy on a device that nobody waits for: see `send`."""
         return self._map(lambda x: send(x, device))
 
-    def rows(self, chosen: Tensor | slice) -> Self:
-        """Return the rows of every tensor that `chosen` names: numbers [n], a mask, or a slice."""
-        return self._map(lambda x: x[chosen])
+    def rows(self, index: Tensor | slice) -> Self:
+        """Return the rows of every tensor that `index` names: numbers [n], a mask, or a slice."""
+        return self._map(lambda x: x[index])
 
     def pin_memory(self) -> Self:
         """Return a copy in page-locked memory (what `DataLoader(pin_memory=True)` calls)."""
@@ -57,6 +78,33 @@ class TensorStruct:
                 yield value
             elif isinstance(value, TensorStruct):
                 yield from value.tensors()
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """Consecutive frames of one camera, of which some have an image.
+
+    images: [n, H, W, 3] uint8. index: [n] int64, ascending; which of the `length` frames they show.
+    """
+
+    images: np.ndarray
+    index: np.ndarray
+    length: int
+
+    @classmethod
+    def of(cls, images: np.ndarray, index: np.ndarray | None = None, length: int | None = None) -> Self:
+        """A batch; by default every frame has an image."""
+        length = len(images) if length is None else length
+        return cls(images, np.arange(length) if index is None else np.asarray(index, np.int64), length)
+
+    def select(self, frames: np.ndarray) -> np.ndarray:
+        """Images of frames that have one."""
+        return self.images[np.searchsorted(self.index, frames)]
+
+    def image(self, frame: int) -> np.ndarray | None:
+        """The image of a frame, if it has one."""
+        row = int(np.searchsorted(self.index, frame))
+        return self.images[row] if row < len(self.index) and int(self.index[row]) == frame else None
 
 
 @dataclass

@@ -13,15 +13,15 @@ say() { echo "install_vulkan: $*"; }
 stop() { say "$*" >&2; exit 1; }
 trap 'say "ended early: line $LINENO, \`$BASH_COMMAND\`, status $?" >&2' ERR
 
-without="or leave this script out: the tests that draw pictures are then skipped"
+without="or leave this script out: the tests that render images are then skipped"
 [ -r "$system/etc/os-release" ] || stop "cannot tell which system this is (no /etc/os-release);" \
-  "install a Mesa Vulkan driver >= $oldest by hand, $without"
+  "install a Mesa Vulkan driver >= $oldest manually, $without"
 # shellcheck source=/dev/null
 . "$system/etc/os-release"
 case " ${ID:-} ${ID_LIKE:-} " in
   *" debian "* | *" ubuntu "*) ;;
   *) stop "this is ${PRETTY_NAME:-an unknown system}, neither Debian nor Ubuntu;" \
-    "install a Mesa Vulkan driver >= $oldest by hand, $without" ;;
+    "install a Mesa Vulkan driver >= $oldest manually, $without" ;;
 esac
 shopt -s inherit_errexit # not before: the bash of other systems may be too old to know it
 
@@ -83,7 +83,7 @@ elif ! recent "$offered"; then
   sources=$(apt-get indextargets --format '$(REPO_URI) $(CODENAME) $(COMPONENT)' 'Created-By: Packages')
   if [ -z "$(awk -v suite="$suite" '$2 == suite' <<<"$sources")" ]; then
     mirror=$(awk -v suite="$VERSION_CODENAME" '$2 == suite && $3 == "main" && !seen++ { print $1 }' <<<"$sources")
-    [ -n "$mirror" ] || stop "found no package source of $VERSION_CODENAME to take $suite from; add $suite by hand"
+    [ -n "$mirror" ] || stop "found no package source of $VERSION_CODENAME to take $suite from; add $suite manually"
     list="/etc/apt/sources.list.d/$suite.list"
     keys=/usr/share/keyrings/debian-archive-keyring.gpg
     option=""

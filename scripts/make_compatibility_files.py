@@ -3,7 +3,8 @@ r"""Write `tests/data/compatibility`: files of every published format, and what 
     python scripts/make_compatibility_files.py tests/data/compatibility
 
 Run it at the version whose files later versions have to read, from the root of a clone with the extras `dev`, `sim`,
-`vlm`, `baselines` and `orbax`, on a CPU. `tests/test_compatibility.py` opens the files and compares what it gets with
+`vlm`, `baselines` and `orbax`, on a CPU. `tests/end_to_end/test_compatibility.py` opens the files and compares what it
+gets with
 `expected.json`. Floating-point figures agree to 1e-5 between CPUs, not bitwise. Never regenerate the folder to make
 that test pass: a failure means that files of users can no longer be read.
 
@@ -128,16 +129,16 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def command(module: str, *arguments: str | Path) -> str:
-    """Run `python -m mme_vla.<module> <arguments>` in this process; what it prints."""
-    before, sys.argv = sys.argv, [f"mme_vla.{module}", *map(str, arguments)]
+def command(name: str, *arguments: str | Path) -> str:
+    """Run `mme-vla <name> <arguments>` in this process; what it prints."""
+    before, sys.argv = sys.argv, ["mme-vla", name, *map(str, arguments)]
     printed = StringIO()
     try:
         with redirect_stdout(printed), mock.patch.dict(os.environ, COLUMNS="120"):
-            runpy.run_module(f"mme_vla.{module}", run_name="__main__")
+            runpy.run_module("mme_vla", run_name="__main__")
     except SystemExit as end:
         if end.code not in (None, 0):
-            raise RuntimeError(f"{module} {' '.join(map(str, arguments))} ended with {end.code}") from end
+            raise RuntimeError(f"{name} {' '.join(map(str, arguments))} ended with {end.code}") from end
     finally:
         sys.argv = before
     return printed.getvalue()
@@ -177,15 +178,15 @@ def actions(policy: Any, width: int = 8, depth: bool = False) -> list[Any]:
 
 def make_dataset(folder: Path, scratch: Path) -> None:
     """Two synthetic episodes as a dataset of images and as one of videos, and the side file of first frames."""
-    from h5_files import write_file
+    from helpers.h5_files import write_file
 
     recordings = scratch / "h5"
     recordings.mkdir()
     write_file(recordings / "record_dataset_PickXtimes.h5", [22, 20], [6, 0], poses=True, depth=True, choices=True)
-    command("data.convert", f"input={recordings}", f"output={folder / 'dataset'}", "images=png")
-    command("data.convert", f"input={recordings}", f"output={folder / 'dataset_video'}", "names=lerobot",
+    command("convert", f"input={recordings}", f"output={folder / 'dataset'}", "images=png")
+    command("convert", f"input={recordings}", f"output={folder / 'dataset_video'}", "names=lerobot",
             "keyframes=true")  # fmt: skip
-    command("data.exec_starts", f"input={recordings}", f"output={folder / 'exec_starts.json'}")
+    command("exec-starts", f"input={recordings}", f"output={folder / 'exec_starts.json'}")
 
 
 def make_policies(folder: Path) -> None:
@@ -237,7 +238,7 @@ def policy_figures(folder: Path, scratch: Path) -> dict[str, Any]:
 
 def export(folder: Path) -> None:
     for target in ("lerobot", "openpi", "released"):
-        command("weights.convert", folder / "pretrained" / "pi05_past_actions", folder / "exports" / target,
+        command("weights", folder / "pretrained" / "pi05_past_actions", folder / "exports" / target,
                 "--to", target)  # fmt: skip
 
 
@@ -292,12 +293,13 @@ def evaluate(folder: Path) -> None:
 
 
 def evaluate_scripted(folder: Path, output: Path) -> Any:
-    """Run, or go on with, four episodes in the tests' own environment, which needs no simulator."""
-    from rollout_scripted_env import make_far_env
+    """Run, or continue with, four episodes in the tests' own environment, which needs no simulator."""
+    from helpers.scripted_env import make_moving_env
 
     return mme_vla.evaluate(
-        folder / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3, output=output, base=make_far_env,
-        shown=False, max_steps=24, flow_steps=2, workers=1, max_batch=1, video="all",
+        folder / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3, output=output,
+        base=make_moving_env,
+        show_progress=False, max_steps=24, flow_steps=2, workers=1, max_batch=1, video="all",
     )  # fmt: skip
 
 
@@ -310,7 +312,7 @@ def result_rows(folder: Path, episodes: int, scratch: Path) -> list[dict[str, st
 
 
 def probe(folder: Path, output: Path, *more: str) -> str:
-    """Probe a checkpoint on the dataset, or go on with it; the table that is printed."""
+    """Probe a checkpoint on the dataset, or continue with it; the table that is printed."""
     return command(
         "probe", f"checkpoint={folder / 'training' / 'framesamp'}", f"recordings={folder / 'dataset'}", "draws=2",
         "moments=2", "flow_steps=2", "recorded=1", "with=[shuffle,drop:1]", "scan=true", "device=cpu",
@@ -348,8 +350,8 @@ def tidy(folder: Path) -> None:
     (folder / "probe" / "page.html").unlink()
     for file in (folder / "training").glob("*/summary.json"):
         file.write_text(file.read_text().replace(f"{REPOSITORY}/", ""))
-    claims = folder / "evaluation" / "shared" / "claims.jsonl"
-    claims.write_text(claims.read_text().replace(socket.gethostname(), "host"))
+    for claim in (folder / "evaluation" / "shared" / "claims").glob("*.json"):
+        claim.write_text(claim.read_text().replace(socket.gethostname(), "host"))
 
 
 def figures(folder: Path, scratch: Path) -> dict[str, Any]:

@@ -6,20 +6,20 @@ from typing import Any
 from torch import Tensor, nn
 
 from mme_vla import Integration, MemoryTokens, register
-from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Block
+from mme_vla.backbone.attention import PI05_VISIBILITY, Block
 from mme_vla.integration.base import required
 
 
 @register("integration", "gist")
 class Gist(Integration):
-    """Mean of the memory → condition of every action norm; all of it → tokens that the actions may look at."""
+    """Mean of the memory → condition of every action norm; all of it → tokens that the actions attend to."""
 
     def __init__(self, backbone: Any) -> None:
         super().__init__(backbone)
         self.memory_width = backbone.action.width
         self.to_condition = nn.Linear(self.memory_width, self.memory_width)
-        seen = {"images", "prompt", "memory"}
-        self.visibility = {**PI05_VISIBILITY, "memory": seen, "action": seen | {"action"}}
+        visible = {"images", "prompt", "memory"}
+        self.visibility = {**PI05_VISIBILITY, "memory": visible, "action": visible | {"action"}}
 
     def condition(self, memory: MemoryTokens | None) -> Callable[[Tensor], Tensor]:
         memory = required(memory)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from mme_vla import History, PerceptualMemory, StorageSpec, register
-from mme_vla.memory.base import whole_frames
+from mme_vla.memory.base import all_patches
 
 
 @register("memory", "last_frames")
@@ -16,4 +16,4 @@ class LastFrames(PerceptualMemory):
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         frames = np.arange(step, -1, -self.spacing)[: self.frames][::-1]
-        return whole_frames(frames, self.storage.grid)
+        return all_patches(frames, self.storage.grid)

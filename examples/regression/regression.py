@@ -1,4 +1,4 @@
-"""A backbone of one's own: a small transformer that answers at once, trained on the absolute error."""
+"""An own backbone: a small transformer that predicts a chunk in one pass, trained on the absolute error."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,11 +8,10 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla import Backbone, Batch, register
-from mme_vla.backbone.base import Inject
-from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.blocks import Block, Span, attention_mask
-from mme_vla.backbone.pi05.siglip import pool_grid
-from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.backbone.attention import Block, Span, additive_mask, attend, attention_mask
+from mme_vla.backbone.base import HasLoraTargets, Injection
+from mme_vla.backbone.config import BackboneConfig
+from mme_vla.speed import Recomputes
 
 
 class Layer(nn.Module):
@@ -32,19 +31,18 @@ class Layer(nn.Module):
 
 
 @register("backbone", "regression")
-class Regression(Backbone):
+class Regression(Backbone, HasLoraTargets, Recomputes):
     """Patches, words and memory in one sequence; a learned query for each step of the chunk reads it."""
 
     Config = BackboneConfig  # one's own dataclass will do; integrations read `vlm.width` and the like from it
-    hosts = frozenset({"blocks"})
-    adapted, heads = ("qkv", "out"), ("head",)
+    supports = frozenset({"blocks"})
+    lora_targets, heads = ("qkv", "out"), ("head",)
 
     def __init__(self, config: BackboneConfig, extra_experts: Mapping[str, Any] | None = None) -> None:
         super().__init__(config, extra_experts)
         width, vision = config.vlm.width, config.vision
-        self.vision_width = self.token_width = width
-        self.depth, self.head_dim = config.depth, width // config.num_heads
-        self.horizon, self.action_dim, self.vocab_size = config.horizon, config.action_dim, config.vocab_size
+        self.vision_width = width
+        self.horizon, self.action_dim = config.horizon, config.action_dim
         self.image_size, self.grid = vision.image_size, vision.image_size // vision.patch_size
         self.vision = nn.Conv2d(3, width, vision.patch_size, vision.patch_size)
         self.words, self.order = nn.Embedding(config.vocab_size, width), nn.Embedding(1024, width)
@@ -57,19 +55,15 @@ class Regression(Backbone):
     def encode_images(self, images: Tensor) -> Tensor:
         return self.vision(images).flatten(2).transpose(1, 2) + self.places
 
-    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        return pool_grid(self.encode_images(images), grid, pooling)
-
-    def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
-        tokens = self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])  # b v n d
-        seen = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
+    def embed(self, batch: Batch) -> list[Block]:
+        tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, batch.images.shape[:2])  # b v n d
+        mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.words(batch.prompt) + self.order.weight[: batch.prompt.shape[1]]
-        return [Block("images", tokens.flatten(1, 2), seen, "vlm"), Block("prompt", words, batch.prompt_mask, "vlm")]
+        return [Block("images", tokens.flatten(1, 2), mask, "vlm"), Block("prompt", words, batch.prompt_mask, "vlm")]
 
-    def answer(self, batch: Batch, images: Tensor, inject: Inject) -> Tensor:
+    def predict(self, injection: Injection) -> Tensor:
         """The chunk [b, h, a]."""
-        injection = inject(self.observation_blocks(batch, images))
-        queries = self.queries.expand(len(images), -1, -1)
+        queries = self.queries.expand(len(injection.blocks[0].tokens), -1, -1)
         everywhere = torch.ones(queries.shape[:2], dtype=torch.bool, device=queries.device)
         blocks = [*injection.blocks, Block("action", queries, everywhere, "action")]
         x, valid = torch.cat([b.tokens for b in blocks], 1), torch.cat([b.mask for b in blocks], 1)
@@ -80,18 +74,18 @@ class Regression(Backbone):
             x = checkpoint(layer, x, mask, use_reentrant=False) if keep_nothing else layer(x, mask)
         return self.head(x[:, -self.horizon :])
 
-    def loss(self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor]) -> Tensor:
+    def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
         assert batch.actions is not None
-        return (self.answer(batch, images, inject).float() - batch.actions.float()).abs().mean(-1)
+        return (self.predict(injection).float() - batch.actions.float()).abs().mean(-1)
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        return self.answer(batch, images, inject)
+        return self.predict(injection)
 
-    def recompute(self, wanted: bool) -> None:
-        self._recompute = wanted
+    def recompute(self, mode: bool | str) -> None:
+        self._recompute = bool(mode)
 
     def parts(self) -> Mapping[str, str]:
         return {"vision": r"vision\.|places", "vlm": r"words\.|order\.", "action": ""}

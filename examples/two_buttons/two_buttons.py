@@ -1,12 +1,10 @@
 """A task of one's own: press two buttons in the order that the goal says."""
 
 from mme_vla import Task, register
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import build_button
-from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.placement import Draws, draw_button
 from mme_vla.envs.scene.predicates import pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import Choice, SubTask
 
 NAMES = ("left", "right")
 PLACES = ((-0.1, 0.15), (-0.1, -0.15))  # about where they stand, metres from the table's middle
@@ -14,7 +12,7 @@ PLACES = ((-0.1, 0.15), (-0.1, -0.15))  # about where they stand, metres from th
 
 @register("task", "TwoButtons")
 class TwoButtons(Task):
-    """Which button comes first is drawn from the seed, and said in the goal."""
+    """The seed decides which button comes first; the goal names it."""
 
     def build(self, draws: Draws) -> None:
         spots = [draw_button(draws, place, (0.1, 0.1)) for place in PLACES]

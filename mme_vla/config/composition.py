@@ -1,35 +1,96 @@
-"""Composition of the YAML tree, and the decorator that turns a function into a `python -m` command.
+"""Composition of the YAML tree: every command and `build_policy` read the same Hydra tree.
 
-Every command and `build_policy` read the same Hydra tree. Mistakes in what the user typed are found here, before any
-work starts, and come back as one `UserError` with the near names.
+Mistakes in overrides are found here, before any work starts, and raise one `UserError` with the near names.
 """
 
 import functools
-import logging
-import os
-import pickle
 import sys
-import warnings
-from collections.abc import Callable, Sequence
-from itertools import zip_longest
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
-from hydra._internal.utils import get_args_parser
+from hydra import version
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.types import Override, ValueType
-from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobRuntime
+from hydra.errors import OverrideParseException
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from mme_vla.config import plugins
-from mme_vla.config.endings import print_user_errors as print_user_errors
-from mme_vla.config.help import help_page, unknown_option
-from mme_vla.config.hydra_engine import VERSION_BASE, is_fixed, own_hydra, parse
-from mme_vla.config.hydra_engine import config_dir as config_dir
-from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
-from mme_vla.config.naming import remember_name, true_name
-from mme_vla.config.words import join_memories, several_memories
-from mme_vla.errors import UserError, printable
+from mme_vla.config.naming import (
+    POLICY,
+    Sections,
+    decisive,
+    join_memories,
+    literal,
+    may_be_of,
+    several_memories,
+    variant_name,
+)  # fmt: skip
+from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
+from mme_vla.errors import UserError
+
+VERSION_BASE = "1.3"
+
+
+def _load_installed_plugins() -> None:
+    """Load Hydra's plugins, but none of a folder `hydra_plugins` of the current directory."""
+    before, here = list(sys.path), Path.cwd().resolve()
+    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]
+    try:
+        Plugins.instance()
+    finally:
+        sys.path[:] = before
+
+
+_load_installed_plugins()
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the repository's."""
+    package = Path(__file__).resolve().parents[1]
+    shipped = package / "configs"
+    return shipped if shipped.is_dir() else package.parent / "configs"
+
+
+@contextmanager
+def local_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
+    """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
+    base = version.VersionBase.instance()
+    outer, outer_base = GlobalHydra.instance().hydra, base.version_base
+    GlobalHydra.instance().clear()
+    search_path = create_config_search_path(str(directory))
+    for folder in extra_dirs:
+        search_path.prepend("command-line", f"file://{folder.resolve()}", anchor=SearchPathQuery(provider="schema"))
+    try:
+        version.setbase(VERSION_BASE)
+        name = JobRuntime.instance().get("name")  # a sweep's next job is still to be called by it
+        yield Hydra.create_main_hydra2(task_name=name, config_search_path=search_path)
+    finally:
+        GlobalHydra.instance().hydra = outer
+        base.version_base = outer_base
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """Overrides under Hydra's grammar."""
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        for override in parsed:
+            if not override.key_or_group:
+                raise OverrideParseException(str(override.input_line), "the key is missing")
+    except OverrideParseException as error:
+        raise UserError(
+            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. "
+            "Write key=value, +key=value to add a key, ~key to remove one; quote values with special characters."
+        ) from error
+    return parsed
 
 
 def compose(
@@ -46,61 +107,25 @@ def compose(
         overrides: as on the command line: `["model=framesamp_modul", "train.lr=1e-4"]`.
         directory: the tree; the library's own by default.
         extra_dirs: further trees searched after it, as `--config-dir` adds them.
-
-    Raises:
-        UserError: a name or key that does not exist, a value of the wrong kind, or a file that cannot be read.
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
-    words = tuple(several_memories(overrides))
-    if is_fixed(trees, words):
-        return pickle.loads(_composed_once(config_name, words, trees))
-    return _composed(config_name, words, trees)
-
-
-@functools.lru_cache(maxsize=512)
-def _composed_once(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]) -> bytes:
-    """The composition as bytes, a new copy from which takes a millisecond where composing takes a hundred."""
-    return pickle.dumps(_composed(config_name, overrides, trees))
-
-
-def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]) -> DictConfig:
-    directory, *extra_dirs = trees
     for folder in trees:
         if not folder.is_dir():
             raise UserError(f"The config folder {str(folder)!r} does not exist.")
-    with own_hydra(directory, extra_dirs) as engine:
-        tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
+    words = several_memories(overrides)
+    with local_hydra(trees[0], trees[1:]) as engine:
+        tree = ConfigTree(engine.config_loader, config_name, parse(words))
         try:
-            cfg = join_memories(tree.composed(overrides))
+            cfg = join_memories(hydra.compose(config_name, words))
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
     if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
-        remember_name(cfg, tree)
         cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
 
 
-def check_overrides(
-    config_name: str,
-    overrides: Sequence[str],
-    *,
-    directory: Path | None = None,
-    extra_dirs: Sequence[Path] = (),
-) -> None:
-    """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included.
-
-    Raises:
-        UserError: as `compose`.
-    """
-    columns = [_choices(override) for override in parse(overrides)]
-    for row in zip_longest(*columns) if columns else [()]:
-        # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
-        chosen = [column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column]
-        compose(config_name, chosen, directory=directory, extra_dirs=extra_dirs)
-
-
-def _name_under_hydra(*, _root_: DictConfig) -> str:
+def name_under_hydra(*, _root_: DictConfig) -> str:
     """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on the run's folder."""
     if not HydraConfig.initialized():
         return str(_root_.name)  # `compose` and the command have set it
@@ -116,146 +141,68 @@ def command_trees() -> tuple[Path, ...]:
     return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))
 
 
-OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
+OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
 
 
 def import_plugins(cfg: DictConfig) -> None:
-    """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`.
-
-    Raises:
-        UserError: there is no such module.
-    """
+    """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`."""
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
 
 
-def cli[T](
-    config_name: str, directory: Path | None = None
-) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
-    """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
-
-    Before the command starts the overrides are checked. How it ends when the user, the system or the disk ends it is
-    `print_user_errors`' matter; any other exception keeps its traceback. Called with a config, the decorated function
-    runs `main` directly.
-    """
-
-    def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
-        @functools.wraps(main)
-        def job(cfg: DictConfig) -> T:
-            with print_user_errors():  # here too: Hydra would print a traceback before it gets further
-                _require_values(cfg)
-                join_memories(cfg)
-                if {"name", "memory"} <= set(cfg):
-                    cfg.name = _name_under_hydra(_root_=cfg)
-                import_plugins(cfg)
-                return main(cfg)
-
-        @functools.wraps(main)
-        def command(cfg: DictConfig | None = None) -> T | None:
-            if cfg is not None:
-                import_plugins(cfg)
-                return main(cfg)
-            tree = directory or config_dir()
-            sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
-            with print_user_errors():
-                _check_command_line(config_name, tree)
-                start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
-                # Hydra makes the run folder: what the disk says to that is to come here, not to be printed there.
-                os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-                try:
-                    start(job)()
-                except HydraException as error:
-                    raise UserError(str(error)) from error
-            return None
-
-        return command
-
-    return decorate
-
-
-def options_first(words: Sequence[str]) -> list[str]:
-    """Move the options of a command line before its overrides: Hydra's parser takes no other order.
-
-    A command line with an unknown option stays as it is.
-    """
-    args, unknown = get_args_parser().parse_known_intermixed_args(words)
-    if unknown:
-        return list(words)
-    options = list(words)
-    options.reverse()
-    for override in reversed(args.overrides):
-        options.remove(override)  # its last occurrence: the value of an option may be the same word
-    return [*reversed(options), *args.overrides]
-
-
-def _check_command_line(config_name: str, tree: Path) -> None:
-    args, unknown = get_args_parser().parse_known_intermixed_args()
-    if unknown:
-        raise unknown_option(unknown[0], sys.argv[1:], known_keys(config_name, tree))
-    if args.help:
-        extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
-        print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
-        raise SystemExit(0)
-    if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
-        return  # nothing of this tree is composed
-    extra = [Path(args.config_dir).resolve()] if args.config_dir else []
-    check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
-
-
-def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
-    """What a command answers to `--help` and these words (`mme_vla.config.help`).
+def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
+    """The name of a composition, from the models of these trees.
 
     Args:
-        trees: folders of YAML files, the library's first.
-
-    Raises:
-        UserError: a word that is neither a group nor an override that fits.
+        config_name: the file that was composed. trees: folders of YAML files, the library's first.
     """
+    if isinstance(cfg.get("memory"), ListConfig):
+        cfg = join_memories(cfg.copy())
+    configured_name = str(cfg.name)
+    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
+    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
+    plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
 
-    def chosen(overrides: Sequence[str]) -> dict[str, str]:
-        compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
-        with own_hydra(trees[0], trees[1:]):
-            cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
-            taken = cfg.hydra.runtime.choices.items()
-            words = {group: "null" if name is None else str(name) for group, name in taken}
-            return {group: name for group, name in words.items() if not group.startswith("hydra/")}
+    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
+        library_alone = searched == (config_dir().resolve(),)  # its files do not change while a process runs
+        return (_cached_sections if library_alone else _composed_sections)(config_name, words, searched)
 
-    return help_page(config_name, words, trees, chosen)
+    def parts() -> Sections | None:
+        groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
+        for group, section in groups.items():
+            if section and not section.get("name"):
+                raise UserError(
+                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
+                    f"keys are set beside it, {group}.<key>=<value>."
+                )
+        words = [f"{group}={section.name if section else 'none'}" for group, section in groups.items()]
+        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
+            words.insert(0, f"model={configured_name}")
+        if "members" in (groups.get("memory") or {}):
+            words.append(f"memory.members={literal(OmegaConf.to_container(groups['memory'].members, resolve=True))}")
+        result = composed(tuple(words), trees)
+        return None if result is None else result[1]
 
+    sections = decisive(cfg)
 
-def known_keys(config_name: str, tree: Path) -> list[str]:
-    """Every dotted key of a command's configuration as it is by default."""
-    with own_hydra(tree, []):
-        return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
+    def reference(model: str) -> tuple[str, Sections] | None:
+        if model in plugin_models and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
+            return None
+        return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
 
-
-def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
-    """Let a command's logger, and warnings, speak on standard error; `clock` puts the time of day before each line."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
-    logger.setLevel(logging.INFO)
-    logger.handlers = [handler]
-    logger.propagate = False
-    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
-
-
-class _Printable(logging.Formatter):
-    """Lines as a terminal may have them: they name what untrusted files and clients sent."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
-
-
-def _choices(override: Override) -> list[str]:
-    """The overrides that a sweep stands for; the override itself when it is none."""
-    if not override.is_sweep_override():
-        return [str(override.input_line)]
-    if not override.is_discrete_sweep() or override.value_type == ValueType.GLOB_CHOICE_SWEEP:
-        return []  # an interval has no list of values, a glob names only what exists
-    left = str(override.input_line).partition("=")[0]
-    return [f"{left}={value}" for value in override.sweep_string_iterator()]
+    return variant_name(str(cfg.name), sections, mine | plugin_models, reference, parts)
 
 
-def _require_values(cfg: DictConfig) -> None:
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        raise UserError(f"A value is needed for {', '.join(missing)}: add {' '.join(f'{key}=…' for key in missing)}")
+def _composed_sections(
+    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
+) -> tuple[str, Sections] | None:
+    """Name and decisive keys of a composition; None where these words do not compose."""
+    with local_hydra(trees[0], trees[1:]):
+        try:
+            parse(overrides)
+            cfg = join_memories(hydra.compose(config_name, list(overrides)))
+            return str(cfg.name), decisive(cfg)
+        except (*COMPOSITION_ERRORS, UserError):
+            return None
+
+
+_cached_sections = functools.cache(_composed_sections)

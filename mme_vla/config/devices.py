@@ -18,11 +18,7 @@ FLOAT32_PRODUCTS = ("ieee", "tf32")
 
 
 def find_device(name: str) -> "torch.device":
-    """The device of that name; `auto`: a GPU where there is one.
-
-    Raises:
-        UserError: it is no device, or not here.
-    """
+    """The device of that name; `auto`: a GPU where there is one."""
     import torch
 
     if name == "auto":
@@ -38,11 +34,7 @@ def find_device(name: str) -> "torch.device":
 
 
 def checked_products(how: str) -> str:
-    """`how`, once it is one of `FLOAT32_PRODUCTS`.
-
-    Raises:
-        UserError: it is not.
-    """
+    """`how`, once it is one of `FLOAT32_PRODUCTS`."""
     if how not in FLOAT32_PRODUCTS:
         raise UserError(
             f"policy.float32_products={how!r}: choose ieee (exact products) or tf32 (their inputs keep ten bits on a "

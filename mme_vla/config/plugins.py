@@ -1,6 +1,6 @@
 """Modules of the user's own, whose decorators register memories, tasks, players: imported when the user says so.
 
-What a configuration or command line of the user's names is imported at once. What a checkpoint names is a stranger's
+What a configuration or command line of the user's names is imported at once. What a checkpoint names is an untrusted
 word: it is imported only where the user says `trust_plugins=True` (`--trust-plugins`), or has imported it already.
 """
 
@@ -25,9 +25,6 @@ def import_plugins(names: Iterable[str]) -> None:
 
     The current directory counts as importable, so that a file beside the command is enough. Installed packages come
     first, so that no file there takes the place of one.
-
-    Raises:
-        UserError: there is no such module. What goes wrong inside one keeps its traceback.
     """
     for name in names:
         here = str(Path.cwd())
@@ -51,11 +48,7 @@ def imported_plugins() -> tuple[str, ...]:
 
 
 def plugins_of(config: Any, source: str) -> list[str]:
-    """The modules that a configuration names under `plugins`.
-
-    Raises:
-        UserError: they are not names of modules.
-    """
+    """The modules that a configuration names under `plugins`."""
     names = config.get("plugins") or []
     names = [names] if isinstance(names, str) else names
     listing = isinstance(names, Sequence)
@@ -70,9 +63,6 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
     Args:
         config: the checkpoint's configuration. source: the checkpoint, for messages.
         trust: the user has said that what it names may run here.
-
-    Raises:
-        UserError: it names plugins that are not imported yet and `trust` is False, or one that is not there.
     """
     names = plugins_of(config, source)
     strange = [name for name in names if name not in sys.modules]

@@ -1,12 +1,14 @@
-"""A section of a configuration as the dataclass it stands for: every key and every kind of value is checked here, once.
+"""Reads a section of a configuration into a dataclass: keys, kinds of values, bounds and choices are checked once.
 
-What a value means (a bound, a choice) is checked by the dataclass itself, in `__post_init__`.
+Annotations declare all of it: `port: Annotated[int, Range(0, 65535)]`, `kind: Literal["simple", "grounded"]`.
+`__post_init__` is for what several keys mean together.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from types import NoneType, UnionType
-from typing import Any, Union, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 
@@ -15,69 +17,97 @@ _WORDS: Mapping[Any, str] = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Range:
+    """Bounds of a finite number: from `least` to `most`, and larger than `above`."""
+
+    least: float = -math.inf
+    most: float = math.inf
+    above: float = -math.inf
+
+    def holds(self, value: float) -> bool:
+        """Whether a number is within the bounds."""
+        return math.isfinite(value) and self.least <= value <= self.most and value > self.above
+
+    @property
+    def text(self) -> str:
+        if math.isfinite(self.most):
+            return f" from {self.least:g} to {self.most:g}"
+        return f" above {self.above:g}" if math.isfinite(self.above) else f", {self.least:g} or more"
+
+
+Positive = Annotated[float, Range(above=0)]
+NonNegative = Annotated[float, Range(least=0)]
+PositiveInt = Annotated[int, Range(least=1)]
+NonNegativeInt = Annotated[int, Range(least=0)]
+
+
 class _MisfitError(Exception):
-    """A value of another kind than its key's."""
+    """A value that its key does not take."""
 
 
-def read_section[T](kind: type[T], given: Any, where: str = "", *, others: bool = False, **fixed: Any) -> T:
+def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any) -> T:
     """Build a dataclass from a mapping.
 
     Args:
-        kind: a dataclass; the annotations of its fields say what their values must be: `bool`, `int`, `float` (whole
-            numbers too), `str`, a dataclass (a section of its own), tuples of these (lists are taken), mappings, `Any`,
-            and unions with None.
-        given: the section. where: its dotted name in messages; empty for the top level.
-        others: whether keys of other purposes may stand in it; they are left aside.
-        fixed: fields that the section does not decide.
-
-    Raises:
-        UserError: no mapping, an unknown or missing key, a value of another kind; and whatever `kind` itself refuses.
+        kind: a dataclass. Its annotations: `bool`, `int`, `float` (whole numbers too), `str`, `Literal`, a dataclass (a
+            section of its own), tuples of these (lists are taken), mappings, `Any`, unions, and numbers with a `Range`.
+        values: the section. where: its dotted name in messages; empty for the top level.
+        others: ignore keys that are no fields. fixed: fields that the section does not set.
     """
     specs = {spec.name: spec for spec in fields(kind) if spec.init and spec.name not in fixed}  # type: ignore[arg-type]
     needed = [n for n, spec in specs.items() if spec.default is MISSING and spec.default_factory is MISSING]
-    if others and isinstance(given, Mapping):
-        given = {key: value for key, value in given.items() if key in specs}
-    found, hints = section_keys(given, where, specs), get_type_hints(kind)
+    if others and isinstance(values, Mapping):
+        values = {key: value for key, value in values.items() if key in specs}
+    parsed, hints = section_keys(values, where, specs), get_type_hints(kind, include_extras=True)
     for key in needed:
-        if key not in found:
-            raise _lacking(where, key, found)
+        if key not in parsed:
+            raise _lacking(where, key, parsed)
     read: dict[str, Any] = {}
-    for key, value in found.items():
+    for key, value in parsed.items():
         name = f"{where}.{key}" if where else key
         try:
             read[key] = _converted(value, hints[key], name)
         except _MisfitError:
-            shown = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
-            raise UserError(f"{name}{shown} must be {_expected(hints[key])}.") from None
+            assigned = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
+            choices = _choices(hints[key])
+            if choices and isinstance(value, str):
+                raise UserError(f"{name}{assigned}. {did_you_mean(value, map(str, choices))}") from None
+            raise UserError(f"{name}{assigned} must be {_expected(hints[key])}.") from None
     return kind(**read, **fixed)
 
 
-def section_keys(given: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
-    """A mapping with no unknown key, and with a value for every required one.
-
-    Raises:
-        UserError: it is something else; `where` names it.
-    """
-    if not isinstance(given, Mapping):
-        raise UserError(f"{where or 'the configuration'} must be a section of keys, got {brief(given)}.")
-    for key in given:
+def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
+    """A mapping with no unknown key, and with a value for every required one."""
+    if not isinstance(values, Mapping):
+        raise UserError(f"{where or 'the configuration'} must be a section of keys, got {brief(values)}.")
+    for key in values:
         if key not in known:
             name = brief(key, quote=False)
             raise UserError(f"Unknown key {f'{where}.' if where else ''}{name}. {did_you_mean(str(key), list(known))}")
     for key in required:
-        if given.get(key) is None:
-            raise _lacking(where, key, given)
-    return {str(key): value for key, value in given.items()}
+        if values.get(key) is None:
+            raise _lacking(where, key, values)
+    return {str(key): value for key, value in values.items()}
 
 
-def _lacking(where: str, key: str, given: Iterable[Any]) -> UserError:
-    return UserError(f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(given) or 'none'}.")
+def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
+    return UserError(f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(keys) or 'none'}.")
 
 
 def _converted(value: Any, kind: Any, name: str) -> Any:
-    """The value as its field wants it: sections read, lists as tuples."""
+    """The value of a field: sections are read, lists become tuples."""
     origin, inside = get_origin(kind), get_args(kind)
     if kind is Any:
+        return value
+    if origin is Annotated:
+        number = _converted(value, inside[0], name)
+        if not all(bound.holds(number) for bound in inside[1:] if isinstance(bound, Range)):
+            raise _MisfitError
+        return number
+    if origin is Literal:
+        if not any(value == choice and type(value) is type(choice) for choice in inside):
+            raise _MisfitError
         return value
     if origin in (Union, UnionType):
         return _first_that_fits(value, inside, name)
@@ -114,9 +144,19 @@ def _tuple(value: Any, kinds: Sequence[Any], name: str) -> tuple[Any, ...]:
     return tuple(_converted(item, kind, name) for item, kind in zip(value, each, strict=True))
 
 
+def _choices(kind: Any) -> Sequence[Any]:
+    if get_origin(kind) in (Union, UnionType):
+        return [choice for part in get_args(kind) for choice in _choices(part)]
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
 def _expected(kind: Any) -> str:
-    """The words for what a field takes."""
+    """What a field takes, for messages."""
     inside = get_args(kind)
+    if get_origin(kind) is Annotated:
+        return f"{_expected(inside[0])}{inside[1].text}"
+    if get_origin(kind) is Literal:
+        return " or ".join(map(str, inside))
     if get_origin(kind) in (Union, UnionType):
         return " or ".join(map(_expected, inside))
     if get_origin(kind) is tuple:

@@ -1,6 +1,373 @@
-"""`python -m mme_vla.data.convert`: the command is mme_vla/commands/convert.py."""
+"""From official HDF5 demonstrations to one LeRobot v3.0 dataset.
 
-from mme_vla.commands import run
+Every episode first becomes a complete small dataset of its own in `<output>.partial`, which is renamed when it is
+whole; at the end all of them are merged and the result is moved to `<output>` in one step. LeRobot's own writer keeps
+files open across episodes, so a killed run would leave files that cannot be read: here it leaves finished episodes,
+and the next run continues with the missing ones.
+"""
 
-if __name__ == "__main__":
-    run("convert")
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.data.console import progress, quiet_libraries
+from mme_vla.data.hdf5 import (
+    POSE_STATE,
+    SUBGOALS,
+    EpisodeRef,
+    RawEpisode,
+    RawFrame,
+    open_episode,
+    recorded_options,
+)
+from mme_vla.data.keyframes import file_of, write_keyframes
+from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
+from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.utils import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
+from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+@contextmanager
+def episodes_without_statistics() -> Iterator[None]:
+    """While this lasts, LeRobot reads a dataset's list of episodes at once, and without their statistics.
+
+    It asks the `datasets` library, whose time grows with the square of the number of columns: of a dozen features that
+    are two hundred, nearly all of them statistics, and a fifth of a second for every episode that is merged.
+    """
+    from lerobot.datasets import dataset_metadata
+
+    original = dataset_metadata.load_episodes
+    dataset_metadata.load_episodes = _columns
+    try:
+        yield
+    finally:
+        dataset_metadata.load_episodes = original
+
+
+def _columns(root: Path) -> dict[str, list[Any]]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    tables = []
+    for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
+        names = [name for name in pq.read_schema(file).names if not name.startswith("stats/")]
+        tables.append(pq.read_table(file, columns=names))
+    columns: dict[str, list[Any]] = pa.concat_tables(tables).to_pydict()
+    return columns
+
+
+TILES, COLUMNS, SIDE = 12, 6, 192
+
+
+def episode_sheet(frames: Sequence[RawFrame], title: str) -> "Image":
+    """Front views spread evenly over an episode, each with its step and sub-task."""
+    displayed = [(step, frames[step]) for step in evenly_spaced(len(frames), TILES)]
+    tiles = [
+        Tile(frame.front, f"{step} {frame.subgoals['simple_subgoal_online']}", RED if frame.is_demo else None)
+        for step, frame in displayed
+    ]
+    return contact_sheet(tiles, COLUMNS, title, side=SIDE)
+
+
+def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Path, Path]:
+    """Write `<task>-<index>.png` and `.mp4` of a recorded episode; return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    sheet, video = (folder / f"{task}-{index:04d}.{end}" for end in ("png", "mp4"))
+    with open_episode(EpisodeRef(file, index, task)) as episode:
+        frames, goal = list(episode), episode.goals[0]
+    episode_sheet(frames, f"{task} {index}: {goal}").save(sheet)
+    images = (video_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo) for f in frames)
+    write_video(images, video)
+    return sheet, video
+
+
+SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
+_PARTS, _MERGED, _KEYFRAMES = "episodes", "merged", "keyframes.npz"
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """How images are stored.
+
+    images: `video`, or `png` for lossless images inside the tables (about ten times larger).
+    names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own policies ask for
+        (`columns.NAMES`). Readers here take either.
+    fps: frames per second; 20 is the simulator's control rate.
+    codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
+        between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
+    poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
+    tool_pose: a column of where the tool was; `convert` keeps it where all episodes have it.
+    choices: a column of what was chosen among a task's options, and these options beside the tables; `convert` keeps
+        them where all episodes have them.
+    keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
+    partly: say in two more columns which frames were drawn; `convert` does where an episode was recorded at a choice of
+        frames. The images of the others repeat an earlier one, and readers refuse them.
+    """
+
+    images: str = "video"
+    fps: int = 20
+    codec: str = "h264"
+    crf: int = 0
+    pix_fmt: str = "yuv444p"
+    gop: int = 8
+    poses: tuple[str, ...] = ()
+    tool_pose: bool = False
+    choices: bool = False
+    keyframes: bool = False
+    partly: bool = False
+    names: str = "robomme"
+
+    def __post_init__(self) -> None:
+        if self.images not in ("video", "png"):
+            raise UserError(f"images={self.images!r}: expected 'video' or 'png'.")
+        if self.names not in NAMES:
+            raise UserError(f"names={self.names!r} is no spelling of columns. {did_you_mean(str(self.names), NAMES)}")
+        if self.fps < 1 or self.gop < 1:
+            raise UserError(f"fps={self.fps} and video.gop={self.gop} must be positive.")
+
+
+def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
+    """The dataset's columns, spelt as `options.names` says."""
+    tool = [*POSE, "gripper"]
+    joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
+    kind = "video" if options.images == "video" else "image"
+    choice = {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS}
+    view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
+    columns = {
+        "image": dict(view),
+        "wrist_image": dict(view),
+        "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
+        "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
+        **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
+        **({POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}} if options.tool_pose else {}),
+        **({CHOICE_ACTIONS: choice} if options.choices else {}),
+        "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
+        "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
+        "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
+        **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
+        **{f"{c}{RENDERED_SUFFIX}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
+    }
+    return _spelt(columns, options)
+
+
+def _spelt(columns: dict[str, Any], options: ConvertOptions) -> dict[str, Any]:
+    spelling = NAMES[options.names]
+    return {spelling.get(name, name): value for name, value in columns.items()}
+
+
+def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOptions | None = None) -> int:
+    """Convert these episodes, in this order, into a dataset at `output`; return how many were newly written.
+
+    A run that was interrupted is continued by calling again with the same arguments. The files are told by their
+    content, so one that has changed since is noticed.
+    """
+    if not episodes:
+        raise UserError("There is no episode to convert.")
+    options = replace(options or ConvertOptions(), **recorded_options(episodes))
+    plan = _plan(episodes, options)
+    partial = _work_folder(output)
+    if _finished(output, plan) and not partial.exists():
+        return 0
+    with FolderLock(partial, "conversion"):
+        if _finished(output, plan):  # asked again: another process may have finished it meanwhile
+            drop_plan(partial)
+            return 0
+        return _convert(episodes, output, partial, plan, options)
+
+
+def drop_work(output: Path) -> None:
+    """Remove what a conversion left beside `output` that was killed after it had moved its result there."""
+    partial = _work_folder(output)
+    if partial.exists():
+        with FolderLock(partial, "conversion"):
+            drop_plan(partial)
+
+
+def _work_folder(output: Path) -> Path:
+    return output.with_name(output.name + ".partial")
+
+
+def planned_options(options: ConvertOptions) -> dict[str, Any]:
+    """The options as a plan holds them; what plans from before had none of stands beside them, or where it is said."""
+    beside = ["poses", "tool_pose", "choices", "partly", "keyframes"] + ["names"] * (options.names == "robomme")
+    return {key: value for key, value in asdict(options).items() if key not in beside}
+
+
+def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
+    """What decides the result. Reading whole files takes a small part of what converting them takes."""
+    files = list(dict.fromkeys(ref.file for ref in episodes))
+    with progress("read", sum(file.stat().st_size for file in files), unit="bytes") as advance:
+        sums = {}
+        for file in files:
+            sums[file] = file_sum(file)
+            advance(file.stat().st_size)
+    origins = [
+        {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
+        for ref in episodes
+    ]
+    content = {"poses": list(options.poses), **{key: getattr(options, key) for key in ("tool_pose", "choices")}}
+    content["keyframes"] = options.keyframes
+    return {"options": planned_options(options), "episodes": origins, **{k: v for k, v in content.items() if v}}
+
+
+def _convert(
+    episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
+) -> int:
+    _claim(partial, plan)
+    names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
+    parts = [partial / _PARTS / name for name in names]
+    missing = [i for i, part in enumerate(parts) if not part.is_dir()]
+    with progress("convert", len(parts), len(parts) - len(missing), "episodes") as advance:
+        for i in missing:
+            with quiet_libraries():
+                _write_part(episodes[i], parts[i], options)
+            advance(1)
+    with quiet_libraries():
+        _merge(parts, partial / _MERGED, plan)
+    (partial / _MERGED).rename(output)
+    drop_plan(partial)
+    return len(missing)
+
+
+def _finished(output: Path, plan: dict[str, Any]) -> bool:
+    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
+        return False
+    side = output / SIDE_FILE
+    if side.is_file() and _same(read_json(side, "the facts of a converted dataset").get("plan"), plan):
+        return True
+    raise UserError(
+        f"{output} exists and is not the result of this conversion (other files, other content of a file, other "
+        "episodes or options). Choose another output, or remove that folder yourself."
+    )
+
+
+def _same(stored: Any, plan: dict[str, Any]) -> bool:
+    """Whether a stored plan is this one; plans from before contents were compared name files and sizes only."""
+    if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
+        plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
+    return stored == plan
+
+
+def _claim(partial: Path, plan: dict[str, Any]) -> None:
+    """Make `partial` the work folder of this plan, or recognise it as such."""
+    if not claim_plan(partial, plan):
+        raise UserError(
+            f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
+            "that one to finish it, choose another output, or remove that folder yourself."
+        )
+    for leftover in (partial / "writing", partial / _MERGED):
+        shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
+    (partial / _PARTS).mkdir(exist_ok=True)
+
+
+def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
+    """Write one episode as a dataset of its own; `part` appears only when it is whole."""
+    draft = part.parent.parent / "writing"
+    shutil.rmtree(draft, ignore_errors=True)
+    with open_episode(ref) as episode:
+        _write_dataset(episode, draft, options)
+        if options.keyframes:
+            write_keyframes(episode, draft / _KEYFRAMES)
+        side = {
+            "task": ref.task,
+            "source_file": ref.file.name,
+            "source_episode": ref.index,
+            "seed": episode.seed,
+            "difficulty": episode.difficulty,
+            "goals": episode.goals,
+            "length": episode.length,
+            "exec_start_idx": episode.exec_start,
+            **({"options": episode.options} if options.choices else {}),
+            **({"frames": episode.frames} if episode.frames is not None else {}),
+        }
+    (draft / SIDE_FILE).write_text(json.dumps(side))
+    draft.rename(part)
+
+
+def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> None:
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = None
+    goal = episode.goals[0]
+    tool = {name: episode.pose_actions(name) for name in options.poses}
+    if options.tool_pose:
+        tool[POSE_STATE] = episode.tool_poses()
+    if options.choices:
+        tool[CHOICE_ACTIONS] = episode.choice_actions()
+    for step, frame in enumerate(episode):
+        if dataset is None:
+            video = options.images == "video"
+            encoder = RGBEncoderConfig(vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop)
+            dataset = LeRobotDataset.create(
+                repo_id=f"local/{episode.ref.task}",
+                fps=options.fps,
+                features=features(frame.front.shape, options),
+                root=root,
+                robot_type="panda",
+                use_videos=video,
+                video_backend="pyav",
+                rgb_encoder=encoder if video else None,
+                streaming_encoding=video,
+                # LeRobot drops frames when this queue is full, as a live recorder must: never let it be.
+                encoder_queue_maxsize=episode.length + 1,
+            )
+        row = {
+            "image": frame.front,
+            "wrist_image": frame.wrist,
+            "state": frame.state,
+            "actions": frame.action.astype(np.float32),
+            **{name: rows[step] for name, rows in tool.items()},
+            "is_demo": np.array([frame.is_demo]),
+            "exec_start_idx": np.array([episode.exec_start], np.int32),
+            "step_idx": np.array([step], np.int32),
+            **frame.subgoals,
+            **{f"{c}{RENDERED_SUFFIX}": np.array([c in frame.rendered]) for c in CAMERAS if options.partly},
+            "task": goal,
+        }
+        dataset.add_frame(_spelt(row, options))
+    assert dataset is not None  # an episode has at least one frame
+    dataset.save_episode(parallel_encoding=False)
+    dataset.finalize()
+    for path in root.glob("videos/**/*.mp4"):
+        if (count := count_frames(path)) != episode.length:
+            raise RuntimeError(f"{path} holds {count} frames instead of {episode.length}.")
+
+
+def count_frames(path: Path) -> int:
+    """Number of images in a video file, counted without decoding."""
+    import av
+
+    container = av.open(str(path))
+    try:
+        return sum(packet.size > 0 for packet in container.demux(video=0))
+    finally:
+        container.close()
+
+
+def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    sides = [read_json(part / SIDE_FILE, "the facts of a converted episode") for part in parts]
+    with episodes_without_statistics():
+        aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
+    for video in merged.glob("videos/**/*.mp4"):
+        video.chmod(0o644)  # LeRobot joins videos in private temporary files
+    for i, part in enumerate(parts):
+        if (part / _KEYFRAMES).is_file():
+            file_of(merged, i).parent.mkdir(exist_ok=True)
+            shutil.copy(part / _KEYFRAMES, file_of(merged, i))
+    episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
+    (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
+    write_sums(merged)  # LeRobot's format has none: damage would be read as data

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.data.cache.store import VisionCache
+from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
-from mme_vla.processing.base import PolicyProcessor, Sample
-from mme_vla.processing.collating import collate as collate
-from mme_vla.processing.past_views import past_views
-from mme_vla.processing.subgoal_text import SubgoalText
+from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
+from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
+from mme_vla.processing.base import collate as collate
+from mme_vla.processing.images import past_views
+from mme_vla.processing.prompt import SubgoalText
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside
     them. They depend on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data:
-    tables and token caches are memory-mapped, and an item decodes only the pictures of its window, most often the
+    tables and token caches are memory-mapped, and an item decodes only the images of its window, most often the
     current ones.
     """
 
@@ -78,20 +78,17 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
             seed: of all randomness.
-
-        Raises:
-            UserError: a memory without caches, an impossible offset, or no execution step at all.
         """
         if memory is not None and (caches is None or len(caches) != len(sources)):
             raise UserError(
                 "A policy with memory trains on cached vision tokens, one cache a source: build them with "
-                "`python -m mme_vla.data.cache model=<model> data=<data>` and pass `caches`."
+                "`mme-vla cache model=<model> data=<data>` and pass `caches`."
             )
         if not 0 <= action_offset <= 1:
             raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
-        if processor.reads_subgoal and subgoal is None:
+        if processor.prompt_spec.reads_subgoal and subgoal is None:
             raise UserError(
-                f"The prompt format {processor.prompt_name!r} reads a subgoal: set subgoal_text.kind to "
+                f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set subgoal_text.kind to "
                 "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain."
             )
         if subgoal is not None:
@@ -100,9 +97,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
-        chosen = [np.arange(len(source)) for source in sources] if episodes is None else episodes
-        self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(chosen)]).astype(np.int64)
-        self._episode = np.concatenate([np.asarray(part, np.int64) for part in chosen])
+        selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
+        self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(selected)]).astype(np.int64)
+        self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
         pairs = zip(self._source, self._episode, strict=True)
         self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
         if not self.steps:
@@ -120,7 +117,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def decisions(self, source: int, episode: int) -> Any:
         """Frames of an episode at which the robot decides, without those that lack a full chunk where that counts."""
         decisions = self.sources[source].decisions(episode)
-        short = self.processor.horizon - 1 if self.processor.full_chunks_only else 0
+        short = self.processor.embodiment.action.horizon - 1 if self.processor.samples.full_chunks_only else 0
         return decisions[: max(len(decisions) - short, 0)]
 
     @property
@@ -145,9 +142,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """The item of a frame; frames at which the robot does not decide share their episode's items evenly.
 
         Such are those of the conditioning video, for a sampler that draws from all frames alike.
-
-        Raises:
-            UserError: none of this episode's frames is an item.
         """
         at = np.flatnonzero((self._source == source) & (self._episode == episode))
         decisions = np.asarray(self.decisions(source, episode))
@@ -165,7 +159,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def step_at(self, s: int, episode: int, frame: int) -> Step:
         """Return what is recorded of a frame of an episode of the s-th source, unprocessed."""
         source = self.sources[s]
-        actions, recorded = source.action_chunk(episode, frame, self.processor.horizon, self.action_offset)
+        actions, recorded = source.action_chunk(
+            episode, frame, self.processor.embodiment.action.horizon, self.action_offset
+        )
         return Step(
             source=s,
             episode=episode,
@@ -180,7 +176,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     def past_actions(self, step: Step) -> np.ndarray:
         """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and there are."""
-        most = self.processor.past_actions
+        most = self.processor.prompt_spec.past_actions
         return self.sources[step.source].past_actions(step.episode, step.index, most, self.action_offset)
 
     def observation(self, index: int) -> dict[str, Any]:
@@ -190,13 +186,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        return self.seen(step, rng) | {
+        return self.inputs_at(step, rng) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
             "place": (step.source, step.episode, step.index),
         }
 
-    def seen(self, step: Step, rng: np.random.Generator) -> dict[str, Any]:
+    def inputs_at(self, step: Step, rng: np.random.Generator) -> dict[str, Any]:
         """What the network reads and learns of a step, with what its memory selects: its `history` and `past`."""
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
         item = self.processor.item(self._sample(step, subgoal))
@@ -204,25 +200,29 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             item["action_mask"] = torch.from_numpy(step.recorded)
         if self.memory is not None:
             history = self.caches[step.source].history(step.episode)
-            if self.memory.reads_motion:
+            if uses_proprio(self.memory):
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
-            item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
-            if self.memory.looks_back is not None:
-                read = partial(self._pictures, step.source, step.episode)
-                item["past"] = past_views(self.memory.looks_back, step.index, read, self.processor.images)
+            item["history"] = self.memory.gather_selection(history, step.index, rng if self.jitter else None)
+            if (spec := past_view_spec(self.memory)) is not None:
+                read = partial(self._images, step.source, step.episode)
+                item["past"] = past_views(spec, step.index, read, self.processor.images)
         return item
 
-    def _pictures(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:
-        return [self.sources[source].frames(episode, frames, name) for name in self.processor.cameras]
+    def _images(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:
+        return [self.sources[source].frames(episode, frames, name) for name in self._cameras]
+
+    @property
+    def _cameras(self) -> Sequence[str]:
+        return self.processor.samples.cameras or self.processor.embodiment.camera_names
 
     def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
-        return self.processor.motion(*self.sources[source].own_motion(episode, frames, self.action_offset))
+        return motion_rows(self.processor, *self.sources[source].robot_motion(episode, frames, self.action_offset))
 
     def _sample(self, step: Step, subgoal: str | None) -> Sample:
         """A step with the frames of its window; before the episode's first frame that one is repeated."""
-        source, cameras = self.sources[step.source], self.processor.cameras
-        window = np.arange(step.index - self.processor.window + 1, step.index + 1).clip(min=0)
+        source, cameras = self.sources[step.source], self._cameras
+        window = np.arange(step.index - self.processor.samples.window + 1, step.index + 1).clip(min=0)
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
         return Sample(
@@ -243,3 +243,46 @@ def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> N
                 f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
                 f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}."
             )
+
+
+class GroupDataset(TrainingDataset):
+    """Groups of `processor.samples.group_size` steps, drawn from whole records, conditioning videos included.
+
+    Every episode gives as many groups as every other, whatever its length; an epoch shows about as many steps as there
+    are. A group's steps are distinct, drawn uniformly and sorted; a shorter episode gives all, the last one repeated.
+    """
+
+    def __len__(self) -> int:
+        """Number of groups in an epoch."""
+        episodes = len(self._episode)
+        return episodes * max(round(self.steps / (episodes * self.processor.samples.group_size)), 1)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"group {index} of {len(self)}")
+        at = index % len(self._episode)
+        s, episode = int(self._source[at]), int(self._episode[at])
+        length, size = int(self.sources[s].lengths[episode]), self.processor.samples.group_size
+        rng = np.random.default_rng([self.seed, self.epoch, index])
+        if length >= size:
+            frames = np.sort(rng.choice(length, size, replace=False))
+        else:
+            frames = np.minimum(np.arange(size), length - 1)
+        return self._group(s, episode, frames, rng)
+
+    def observation(self, index: int) -> dict[str, Any]:
+        """The group that ends at a step: the moments before it at which the policy would have been asked."""
+        s, episode, frame = self.locate(index)
+        stride = self.processor.embodiment.action.execute
+        frames = np.arange(frame, -1, -stride)[: self.processor.samples.group_size][::-1]
+        return self._group(s, episode, frames, np.random.default_rng([self.seed, self.epoch, index]))
+
+    def _group(self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
+        steps = [self.step_at(s, episode, int(frame)) for frame in frames]
+        return {
+            "moments": [self.inputs_at(step, rng) for step in steps],
+            "times": frames.astype(np.int64),
+            "goal": steps[-1].goal,
+            "subgoals": steps[-1].subgoals,
+            "place": (s, episode, int(frames[-1])),
+        }

@@ -14,24 +14,30 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.choice_rows import find_choices
-from mme_vla.data.columns import DRAWN, find_columns, names_of, width_of
-from mme_vla.data.hdf5_episode import SUBGOALS
-from mme_vla.data.layout import (
+from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.lerobot_files import (
+    REMEDY,
+    RENDERED_SUFFIX,
     SAMPLE,
+    check_vectors,
     content_fingerprint,
+    find_columns,
     lossy_coding,
+    names_of,
+    open_table,
+    read_episode_table,
     read_exec_starts,
     read_info,
     resolve_root,
+    video_file,
+    width_of,
 )
-from mme_vla.data.table_files import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
-from mme_vla.data.waypoints import Motions, find_motions
+from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
-from mme_vla.embodiment.options import read_options
+from mme_vla.embodiment.action_space import read_options
 from mme_vla.errors import UserError, brief, did_you_mean
-from mme_vla.files import Sums, decoding, read_json
+from mme_vla.utils import Sums, decoding, read_json
 
 SIDE_FILE = "meta/robomme_episodes.json"
 log = logging.getLogger(__name__)
@@ -62,33 +68,29 @@ class EpisodeSource:
                 do not mark their conditioning video.
             name: short name, which the validation split and the cache folder use; by default the folder's.
             max_open_videos: most video files kept open.
-            robot: says which columns hold its pictures, states and actions.
-
-        Raises:
-            UserError: not a v3.0 dataset, a feature is missing, the demonstration flag is missing and no side file
-                is given, or the parts of the dataset contradict each other.
+            robot: says which columns hold its images, states and actions.
         """
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
         info = read_info(self.root)
         features = info["features"]
-        found = find_columns(self.root, features, robot)
-        self.state_names = names_of([features[column] for column in found.state])
-        action_names = names_of([features[column] for column in found.action])
+        matches = find_columns(self.root, features, robot)
+        self.state_names = names_of([features[column] for column in matches.state])
+        action_names = names_of([features[column] for column in matches.action])
         self.robot = replace(robot, action=robot.action.with_names(action_names))
-        columns, self.columns = list(found.tables), found.cameras
+        columns, self.columns = list(matches.tables), matches.cameras
         self.fps = float(info["fps"])
         if robot.fps is not None and robot.fps != self.fps:
             log.warning("%s has %g frames per second; the robot %s has %g.", self.name, self.fps, robot.name, robot.fps)
         self._vectors_of = {
             kind: {name: width_of(features[name]) for name in names}
-            for kind, names in (("state", found.state), ("action", found.action), ("pose", found.pose))
+            for kind, names in (("state", matches.state), ("action", matches.action), ("pose", matches.pose))
         }
         self._motions: dict[int, Motions] = {}
         videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
         self.video_cameras = tuple(videos)
         self.lossy = {name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))}
-        """Of cameras whose films lost something when they were made: how they were coded."""
+        """Of cameras whose videos lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
         self._check_tables()
         episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
@@ -103,8 +105,10 @@ class EpisodeSource:
         for vectors in self._vectors_of.values():
             for name, width in vectors.items():
                 check_vectors(self.root, self._table, name, width)
-        self._drawn = {
-            name: self._column(f"{name}{DRAWN}").astype(bool) for name in self.columns if f"{name}{DRAWN}" in columns
+        self._rendered = {
+            name: self._column(f"{name}{RENDERED_SUFFIX}").astype(bool)
+            for name in self.columns
+            if f"{name}{RENDERED_SUFFIX}" in columns
         }
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
@@ -122,18 +126,14 @@ class EpisodeSource:
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
-        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty.
-
-        Raises:
-            UserError: the file is damaged.
-        """
+        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty."""
         side = self.root / SIDE_FILE
         if not side.exists() and not side.is_symlink():
             return []
-        found = read_json(side, "what is known of a dataset's episodes").get("episodes")
-        if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
+        records = read_json(side, "what is known of a dataset's episodes").get("episodes")
+        if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
             raise UserError(f"{side} holds no list of episodes. {REMEDY}")
-        return found
+        return records
 
     def locate(self, row: int) -> tuple[int, int]:
         """The episode and the frame in it of a row of the tables; LeRobot calls the row `index`."""
@@ -154,9 +154,6 @@ class EpisodeSource:
 
         Returns:
             The number of files compared, 0 for a dataset that was written without checksums.
-
-        Raises:
-            UserError: a file is missing or is not what was written.
         """
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
         for name in sums.table:
@@ -164,7 +161,7 @@ class EpisodeSource:
         return len(sums.table)
 
     def _check_tables(self) -> None:
-        """The same for what every opening reads anyway; tables that hold pictures are left to `verify`."""
+        """The same for what every opening reads anyway; tables that hold images are left to `verify`."""
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
         for name in sums.table:
             if name.startswith("meta/") or (name.startswith("data/") and len(self.video_cameras) == len(self.columns)):
@@ -175,11 +172,7 @@ class EpisodeSource:
         return self._goals[episode]
 
     def options(self, episode: int) -> tuple[Option, ...]:
-        """What the robot could choose among in an episode; none where it does not choose.
-
-        Raises:
-            UserError: the dataset does not tell.
-        """
+        """What the robot could choose among in an episode; none where it does not choose."""
         letters = len(self.robot.action.choice)
         if not letters:
             return ()
@@ -209,22 +202,22 @@ class EpisodeSource:
         first, length = int(self.exec_starts[episode]), int(self.lengths[episode])
         motions = self.robot.action.frames is None
         decided = self._motions_of(episode).decisions if motions else range(first, length)
-        if not self._drawn:
+        if not self._rendered:
             return decided
-        seen = np.logical_and.reduce([self.drawn(episode, name) for name in self.columns])
+        rendered = np.logical_and.reduce([self.rendered(episode, name) for name in self.columns])
         decided = np.asarray(decided)
-        return decided[seen[decided]]
+        return decided[rendered[decided]]
 
-    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+    def rendered(self, episode: int, camera: str | None = None) -> np.ndarray:
         """Which frames of an episode show what was seen, bool [t]; by default of the camera that feeds memory.
 
-        All, unless the dataset was recorded at a choice of frames; the pictures of others are placeholders.
+        All, unless the dataset was recorded at a choice of frames; the images of others are placeholders.
         """
         camera = self.robot.memory_camera if camera is None else camera
         start, length = int(self._starts[episode]), int(self.lengths[episode])
-        if camera not in self._drawn:
+        if camera not in self._rendered:
             return np.ones(length, bool)
-        return self._drawn[camera][start : start + length]
+        return self._rendered[camera][start : start + length]
 
     def action_chunk(self, episode: int, start: int, horizon: int, offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """The chunk decided at frame `start`, the last action repeated past the episode's end (differences are 0).
@@ -256,7 +249,7 @@ class EpisodeSource:
             return np.zeros((0, self.robot.action.width), np.float32)
         return self.actions(episode, first, stop)
 
-    def own_motion(self, episode: int, frames: np.ndarray, offset: int = 0) -> tuple[np.ndarray, ...]:
+    def robot_motion(self, episode: int, frames: np.ndarray, offset: int = 0) -> tuple[np.ndarray, ...]:
         """What the robot felt and did at frames [n] of an episode.
 
         Returns:
@@ -265,9 +258,9 @@ class EpisodeSource:
             action is a motion of many frames.
         """
         stop = int(np.max(frames, initial=0)) + 1
-        own = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
+        is_known = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
         led = np.clip(frames - 1 + offset, 0, stop - 1)
-        return self.states(episode, 0, stop)[frames], self.actions(episode, 0, stop)[led], own
+        return self.states(episode, 0, stop)[frames], self.actions(episode, 0, stop)[led], is_known
 
     def _motions_of(self, episode: int) -> Motions:
         if episode not in self._motions:
@@ -282,12 +275,7 @@ class EpisodeSource:
         return {name: str(_flat(row[name])[0].as_py()).lower() for name in self.subgoal_names}
 
     def frames(self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        """Decode pictures [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory.
-
-        Raises:
-            UserError: no such camera, a frame outside the episode or one that was not drawn, or a damaged or missing
-                video.
-        """
+        """Decode images [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory."""
         indices = np.asarray(indices, np.int64)
         length = int(self.lengths[episode])
         if not len(indices) or indices.min() < 0 or indices.max() >= length:
@@ -295,10 +283,10 @@ class EpisodeSource:
         camera = self.robot.memory_camera if camera is None else camera
         if camera not in self.columns:
             raise UserError(f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
-        if not (drawn := self.drawn(episode, camera)[indices]).all():
+        if not (rendered := self.rendered(episode, camera)[indices]).all():
             raise UserError(
-                f"{self.name}, episode {episode}: {camera} was not drawn at frames {indices[~drawn].tolist()[:5]}. It "
-                "was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
+                f"{self.name}, episode {episode}: {camera} was not drawn at frames {indices[~rendered].tolist()[:5]}. "
+                "It was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
             )
         if camera in self._videos:
             path, offset = self._videos[camera].locate(episode)
@@ -373,7 +361,7 @@ class EpisodeSource:
 
 
 class _VideoFiles:
-    """Which file, and from which second on, holds an episode's pictures of one view."""
+    """Which file, and from which second on, holds an episode's images of one view."""
 
     def __init__(self, root: Path, template: object, view: str, episodes: dict[str, Any]) -> None:
         self._root, self._template, self._view = root, template, view

@@ -1,44 +1,327 @@
-"""The official demonstration files, `record_dataset_<Task>.h5`: which episodes they hold, and opening one."""
+"""The official demonstration files, `record_dataset_<Task>.h5`: their episodes, read frame by frame.
 
+A value is checked where it is read: the files hold tens of gigabytes, and conversion reads each value once.
+"""
+
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.hdf5_episode import CHOICES, FRAMES, POSE_ACTIONS, POSE_STATE, RawEpisode
-from mme_vla.data.hdf5_values import REMEDY, EpisodeRef
-from mme_vla.errors import UserError
-from mme_vla.files import decoding, require_file
+import numpy as np
+from h5py import Empty, h5d, h5s
+
+from mme_vla.data.waypoints import CHOICE_NUMBERS, known_poses, row_of
+from mme_vla.embodiment.action_space import POSE_WIDTH, read_options
+from mme_vla.embodiment.robomme import CAMERAS, LETTERS
+from mme_vla.errors import UserError, brief
+from mme_vla.utils import decoding, parse_json, require_file
+
+REMEDY = "Download or copy the file again."
+
+
+@dataclass(frozen=True)
+class EpisodeRef:
+    """Where one recorded episode lies: `group` (episode_<index>) of `file`; `task` is taken from the file's name."""
+
+    file: Path
+    index: int
+    task: str
+
+    @property
+    def group(self) -> str:
+        return f"episode_{self.index}"
+
+
+SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
+POSE_STATE = "eef_state"
+"""The dataset's column of the tool's pose [6], and the file's name of it among a step's observations."""
+POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
+"""Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
+CHOICES = ("setup/available_multi_choices", "timestep_0/action/choice_action", "timestep_0/info/is_subgoal_boundary")
+"""What an episode has whose options and choices were recorded."""
+FRAMES = "setup/frames"
+"""Where a file keeps the choice of frames it was recorded at, as JSON, if not all were drawn."""
+_IMAGE_KEYS = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
+_REQUIRED = (
+    "obs/joint_state", "obs/gripper_state", "action/joint_action", "info/is_video_demo", "info/is_completed",
+    *(f"info/{name}" for name in SUBGOALS),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One recorded time step. The observation was taken after the action of the same step.
+
+    front, wrist: [H, W, 3] uint8. state: [8] float32, seven joint angles and the first finger's position.
+    action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
+    is_demo: the step belongs to the conditioning video.
+    subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
+    drawn: the cameras that were drawn at this step; of the others `front` and `wrist` repeat an earlier image (the
+        first one, before there is any).
+    """
+
+    front: np.ndarray
+    wrist: np.ndarray
+    state: np.ndarray
+    action: np.ndarray
+    is_demo: bool
+    subgoals: dict[str, str]
+    rendered: frozenset[str] = frozenset(CAMERAS)
+
+
+class RawEpisode:
+    """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
+
+    def __init__(self, ref: EpisodeRef, group: Any) -> None:
+        self.ref, self._group = ref, group
+        with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
+            steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name))
+        if steps != list(range(len(steps))) or not steps:
+            raise UserError(
+                f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
+                f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged."
+            )
+        self.length = len(steps)
+        with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
+            # A recording at a chosen list of frames has images at these alone.
+            image_keys = () if FRAMES in group else _IMAGE_KEYS.values()
+            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*image_keys, *_REQUIRED)))
+            missing = [name for name in needed if name not in group]
+        if missing:
+            raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
+        demo = np.array([self._flag(k, "info/is_video_demo") for k in range(self.length)])
+        self.exec_start = int(demo.sum())
+        if demo[self.exec_start :].any() or self.exec_start == self.length:
+            raise UserError(f"{ref.file} {ref.group}: video frames must come first, then at least one execution frame.")
+
+    def _value(self, name: str) -> Any:
+        with decoding(self._path(name), "a dataset of HDF5", REMEDY):
+            # An episode has thousands: opened as h5py's own objects, each takes more than twice as long.
+            stored = h5d.open(self._group.id, name.encode())
+            if stored.get_space().get_simple_extent_type() == h5s.NULL:
+                return Empty(stored.dtype)
+            array = np.empty(stored.shape, stored.dtype)
+            stored.read(h5s.ALL, h5s.ALL, array)
+            return array[()]
+
+    def _path(self, name: str) -> str:
+        return f"{self.ref.file} {self.ref.group}/{name}"
+
+    def _checked(self, name: str, valid: Callable[[np.ndarray], bool], expected: str) -> np.ndarray:
+        """An array of numbers; raises an error if it is not valid."""
+        array = np.asarray(self._value(name))
+        if array.dtype.kind not in "biuf" or not valid(array):
+            value = f"{array.dtype} {list(array.shape)} {brief(array.reshape(-1)[:8].tolist())}"
+            raise UserError(f"{self._path(name)} holds {value}; expected {expected}. {REMEDY}")
+        return array
+
+    def _numbers(self, step: int, name: str, count: int, finite: bool = True) -> np.ndarray:
+        """The first `count` numbers of a step."""
+        valid = self._checked(
+            f"timestep_{step}/{name}",
+            lambda x: x.ndim <= 1 and x.size >= count and (not finite or bool(np.isfinite(x).all())),
+            f"at least {count} {'finite ' if finite else ''}numbers",
+        )
+        return np.atleast_1d(valid)[:count]
+
+    def _flag(self, step: int, name: str) -> bool:
+        flag = self._checked(f"timestep_{step}/{name}", lambda x: x.size == 1 and x.dtype.kind in "biu", "a flag")
+        return bool(flag.reshape(-1)[0])
+
+    def _text(self, name: str) -> str:
+        value = self._value(name)
+        with decoding(self._path(name), "a text", REMEDY):
+            return _decode(value)
+
+    def _image(self, step: int, camera: str) -> np.ndarray:
+        if self.frames is not None and not self.rendered[camera][step]:
+            raise UserError(
+                f"{self.ref.file} {self.ref.group}: {camera} was not drawn at step {step}; the episode was recorded "
+                f"with frames={self.frames['at']}."
+            )
+        return self._checked(
+            f"timestep_{step}/{_IMAGE_KEYS[camera]}",
+            lambda x: x.dtype == np.uint8 and x.ndim == 3 and x.shape[-1] == 3,
+            "uint8 [height, width, 3]",
+        )
+
+    @property
+    def goals(self) -> list[str]:
+        """All wordings of the goal, lower-case; the first is the one to train with."""
+        with decoding(self._path("setup/task_goal"), "texts", REMEDY):
+            first, *others = np.atleast_1d(self._value("setup/task_goal"))
+            return [_decode(goal).lower() for goal in (first, *others)]
+
+    @property
+    def seed(self) -> int | None:
+        if "setup/seed" not in self._group:
+            return None
+        seed = self._checked("setup/seed", lambda x: x.size == 1 and x.dtype.kind in "iu", "a whole number")
+        return int(seed.reshape(-1)[0])
+
+    @property
+    def difficulty(self) -> str | None:
+        return self._text("setup/difficulty") if "setup/difficulty" in self._group else None
+
+    def __len__(self) -> int:
+        return self.length
+
+    @cached_property
+    def frames(self) -> dict[str, Any] | None:
+        """The choice of frames it was recorded at; None for one that was drawn whole."""
+        if FRAMES not in self._group:
+            return None
+        settings: dict[str, Any] = parse_json(self._text(FRAMES), self._path(FRAMES))
+        return settings
+
+    @cached_property
+    def rendered(self) -> dict[str, np.ndarray]:
+        """Which steps each camera shows, bool [t]."""
+        if self.frames is None:
+            return {camera: np.ones(self.length, bool) for camera in CAMERAS}
+        return {
+            camera: np.array([f"timestep_{k}/{name}" in self._group for k in range(self.length)])
+            for camera, name in _IMAGE_KEYS.items()
+        }
+
+    def subgoals(self) -> Iterator[dict[str, str]]:
+        """The four texts of every step, as in `RawFrame`, without reading images."""
+        subgoals: dict[str, str] = {}
+        for k in range(self.length):
+            if not subgoals or not self._flag(k, "info/is_completed"):
+                subgoals = {name: self._text(f"timestep_{k}/info/{name}").lower() for name in SUBGOALS}
+            yield subgoals
+
+    def joints(self) -> tuple[np.ndarray, np.ndarray]:
+        """Joint angles and joint targets of every step, [t, 7] each, in the file's own precision."""
+        angles = [self._numbers(k, "obs/joint_state", 7) for k in range(self.length)]
+        targets = [self._numbers(k, "action/joint_action", 7) for k in range(self.length)]
+        return np.stack(angles), np.stack(targets)
+
+    def pose_actions(self, column: str) -> np.ndarray:
+        """A column of `POSE_ACTIONS`, [t, 7] float32.
+
+        Of waypoints, which are noted when a motion begins: the one under way, and before the first one of the video
+        or the execution that first one; a part without any is one motion to where it ends.
+        """
+        steps = [self._numbers(k, POSE_ACTIONS[column], 7, finite=False) for k in range(self.length)]
+        return known_poses(
+            np.stack(steps), self.exec_start, lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7)
+        )
+
+    def tool_poses(self) -> np.ndarray:
+        """Where the tool was at every step: position and roll, pitch, yaw, [t, 6] float32."""
+        steps = [self._numbers(k, f"obs/{POSE_STATE}", POSE_WIDTH) for k in range(self.length)]
+        return np.stack(steps).astype(np.float32)
+
+    def choice_actions(self) -> np.ndarray:
+        """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at all others."""
+        rows = np.zeros((self.length, len(CHOICE_NUMBERS)), np.float32)
+        for k in range(self.length):
+            begins = self._flag(k, "info/is_subgoal_boundary") and not self._flag(k, "info/is_completed")
+            if begins or k == self.exec_start:
+                name = f"timestep_{k}/action/choice_action"
+                with self._reported_at(name):
+                    row = row_of(self._text(name))
+                rows[k] = 0 if row is None else row
+        return rows
+
+    @cached_property
+    def options(self) -> list[dict[str, Any]]:
+        """What could be chosen: `label`, `action` and `need_parameter` of each option."""
+        values = parse_json(self._text(CHOICES[0]), self._path(CHOICES[0]), list)
+        with self._reported_at(CHOICES[0]):
+            options = read_options(values, len(LETTERS))
+        return [option.to_dict() for option in options]
+
+    def shot(self, step: int, camera: str) -> dict[str, np.ndarray]:
+        """What a camera (`front`, `wrist`) recorded at a step, and where it stood.
+
+        Returns:
+            `colours` [H, W, 3] uint8; `depth` [H, W] float32 in millimetres; `intrinsic` [3, 3] and the world-to-camera
+            `extrinsic` [3, 4] float64.
+        """
+        colours = self._image(step, camera)
+        parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
+                 "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
+        missing = [name for name in parts.values() if name not in self._group]
+        if missing:
+            raise UserError(f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
+        shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
+        arrays: dict[str, np.ndarray] = {"colours": colours}
+        for name, shape in shapes.items():
+            valid = partial(_is_finite_array, size=math.prod(shape))
+            values = self._checked(parts[name], valid, f"{list(shape)} finite numbers")
+            arrays[name] = values.reshape(shape).astype(np.float32 if name == "depth" else np.float64)
+        return arrays
+
+    @contextmanager
+    def _reported_at(self, name: str) -> Iterator[None]:
+        """Name the value that an error is about."""
+        try:
+            yield
+        except UserError as error:
+            raise UserError(f"{self._path(name)}: {error} {REMEDY}") from None
+
+    def commanded_open(self, step: int) -> bool:
+        """Whether the gripper's command at a step is to be open."""
+        return bool(self._numbers(step, "action/joint_action", 8)[7] > 0)
+
+    def front(self, step: int) -> np.ndarray:
+        """The front image of one step, [H, W, 3] uint8."""
+        return self._image(step, "front")
+
+    def __iter__(self) -> Iterator[RawFrame]:
+        for camera, rendered in self.rendered.items():
+            if not rendered.any():
+                raise UserError(f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}")
+        latest = {camera: self._image(int(rendered.argmax()), camera) for camera, rendered in self.rendered.items()}
+        for k, subgoals in enumerate(self.subgoals()):
+            fingers = self._numbers(k, "obs/gripper_state", 1)
+            now = frozenset(camera for camera, rendered in self.rendered.items() if rendered[k])
+            latest |= {camera: self._image(k, camera) for camera in now}
+            yield RawFrame(
+                **latest,
+                rendered=now,
+                state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers]).astype(np.float32),
+                action=self._numbers(k, "action/joint_action", 8),
+                is_demo=k < self.exec_start,
+                subgoals=subgoals,
+            )
+
+
+def _is_finite_array(array: np.ndarray, size: int) -> bool:
+    return array.size == size and bool(np.isfinite(array).all())
+
+
+def _decode(value: bytes | str) -> str:
+    return value if isinstance(value, str) else str(value, "utf-8")
 
 
 def find_files(inputs: Sequence[str | Path]) -> list[Path]:
-    """Expand files and folders into HDF5 files, sorted by name.
-
-    Raises:
-        UserError: an input does not exist, or a folder holds no .h5 file.
-    """
+    """Expand files and folders into HDF5 files, sorted by name."""
     files: set[Path] = set()
     for entry in map(Path, inputs):
-        found = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
-        if not found or not all(path.is_file() for path in found):
+        matches = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
+        if not matches or not all(path.is_file() for path in matches):
             advice = "give record_dataset_<Task>.h5 files or their folder."
             if (entry / "meta" / "info.json").is_file():
                 advice = (
                     "it is a LeRobot dataset already, named by data.sources as it is. What conversion keeps besides, "
-                    "such as keyframes, needs the HDF5 files: `python -m mme_vla.envs.record` writes them with hdf5=…"
+                    "such as keyframes, needs the HDF5 files: `mme-vla record` writes them with hdf5=…"
                 )
             raise UserError(f"No HDF5 file at {str(entry)!r}: {advice}")
-        files.update(found)
+        files.update(matches)
     return sorted(files, key=lambda path: (path.name, str(path)))
 
 
 def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
-    """All episodes of these files: file by file, each in numerical order.
-
-    Raises:
-        UserError: a file is no HDF5 file or has no episode_<number> group.
-    """
+    """All episodes of these files: file by file, each in numerical order."""
     refs = []
     for file in files:
         task = re.sub(r"^record_dataset_", "", file.stem)
@@ -50,51 +333,27 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     return refs
 
 
-def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
-    """The columns of `POSE_ACTIONS` that every one of these episodes has."""
-    files = {file: [ref.group for ref in refs if ref.file == file] for file in dict.fromkeys(ref.file for ref in refs)}
-    found = set(POSE_ACTIONS)
-    for file, groups in files.items():
-        with _open(file) as handle:
-            found = {n for n in found if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
-    return tuple(name for name in POSE_ACTIONS if name in found)
+def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
+    """What was recorded with these episodes, as `ConvertOptions` names it.
 
-
-def all_have_poses(refs: Sequence[EpisodeRef]) -> bool:
-    """Whether the tool's poses were recorded with every one of these episodes."""
+    Returns:
+        `poses`: the columns of `POSE_ACTIONS` that all episodes have. `tool_pose`, `choices`: whether all have the
+        tool's poses, options and choices. `partly`: whether one of them has images of selected frames alone.
+    """
+    poses, tool_pose, choices, partly = list(POSE_ACTIONS), True, True, False
     for file in dict.fromkeys(ref.file for ref in refs):
         with _open(file) as handle:
-            if not all(f"{ref.group}/timestep_0/obs/{POSE_STATE}" in handle for ref in refs if ref.file == file):
-                return False
-    return True
-
-
-def all_have_choices(refs: Sequence[EpisodeRef]) -> bool:
-    """Whether options and choices were recorded with every one of these episodes."""
-    for file in dict.fromkeys(ref.file for ref in refs):
-        with _open(file) as handle:
-            groups = [ref.group for ref in refs if ref.file == file]
-            if not all(f"{group}/{name}" in handle for group in groups for name in CHOICES):
-                return False
-    return True
-
-
-def any_chosen_frames(refs: Sequence[EpisodeRef]) -> bool:
-    """Whether one of these episodes was drawn at a choice of its frames only."""
-    for file in dict.fromkeys(ref.file for ref in refs):
-        with _open(file) as handle:
-            if any(f"{ref.group}/{FRAMES}" in handle for ref in refs if ref.file == file):
-                return True
-    return False
+            for group in (ref.group for ref in refs if ref.file == file):
+                poses = [name for name in poses if f"{group}/timestep_0/{POSE_ACTIONS[name]}" in handle]
+                tool_pose &= f"{group}/timestep_0/obs/{POSE_STATE}" in handle
+                choices &= all(f"{group}/{name}" in handle for name in CHOICES)
+                partly |= f"{group}/{FRAMES}" in handle
+    return {"poses": tuple(poses), "tool_pose": tool_pose, "choices": choices, "partly": partly}
 
 
 @contextmanager
 def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
-    """Open one episode for reading.
-
-    Raises:
-        UserError: the file or the episode is damaged or has another layout; the message names the place.
-    """
+    """Open one episode for reading."""
     with _open(ref.file) as handle:
         with decoding(ref.file, "HDF5", REMEDY):
             group = handle.get(ref.group)

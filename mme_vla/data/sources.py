@@ -1,11 +1,89 @@
 """The `data` section of a configuration → open datasets."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
+import numpy as np
+
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Split:
+    """Episode numbers, one ascending int64 array for every source."""
+
+    train: list[np.ndarray]
+    val: list[np.ndarray]
+
+
+def split_episodes(
+    sources: Sequence[EpisodeSource],
+    val_fraction: float = 0.0,
+    val_episodes: Sequence[int | str] | None = None,
+) -> Split:
+    """Split every source by episode.
+
+    `val_episodes` holds out episodes by `<source name>/<number>`, or by number where there is one source; a source it
+    names holds out exactly those. Of any other, episode e validates if the first eight
+    bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
+    change when data are added, and needs no random numbers.
+    """
+    named = _by_source(val_episodes or [], sources)
+    unknown = set(named) - {source.name for source in sources}
+    if unknown:
+        raise UserError(
+            f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
+            f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[]."
+        )
+    if not 0 <= val_fraction < 1:
+        raise UserError(f"val_fraction={val_fraction} must lie in [0, 1).")
+    split = Split([], [])
+    for source in sources:
+        episodes = np.arange(len(source))
+        if source.name in named:
+            wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
+            if wrong:
+                raise UserError(
+                    f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
+                    "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1"
+                )
+            held_out = np.isin(episodes, named[source.name])
+        else:
+            held_out = np.array([_fraction(f"{source.name}/{e}") < val_fraction for e in episodes], bool)
+        split.train.append(episodes[~held_out])
+        split.val.append(episodes[held_out])
+    if not sum(map(len, split.train)):
+        raise UserError("The split leaves no episode to train on; lower val_fraction or shorten val_episodes.")
+    return split
+
+
+def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
+    """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any other dataset."""
+    return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
+
+
+def _by_source(names: Sequence[int | str], sources: Sequence[EpisodeSource]) -> dict[str, list[int]]:
+    """Group `<source>/<number>` words, or bare numbers of the only source."""
+    grouped: dict[str, list[int]] = {}
+    for name in names:
+        source, _, number = str(name).rpartition("/")
+        if not number.isdigit() or (not source and len(sources) > 1):
+            raise UserError(
+                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0"
+                + (", since there are several sources." if number.isdigit() else ".")
+            )
+        grouped.setdefault(source or sources[0].name, []).append(int(number))
+    return grouped
+
+
+def _fraction(text: str) -> float:
+    return int.from_bytes(sha256(text.encode()).digest()[:8], "big") / 2**64
+
 
 _KEYS = ("root", "name", "exec_starts")
 
@@ -15,10 +93,7 @@ def open_sources(
 ) -> list[EpisodeSource]:
     """Open the datasets of `data.sources`: folders, `sample`, or mappings with root, name and exec_starts.
 
-    `robot` says which columns hold its pictures, states and actions.
-
-    Raises:
-        UserError: no source, an unknown key, two sources of one name, or a dataset that cannot be used.
+    `robot` says which columns hold its images, states and actions.
     """
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
     if not listed:

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.progress import progress
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import ExactStats, NormStats, QuantileStats, RunningStats
+from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 
@@ -40,9 +40,6 @@ def compute_norm_stats(
         every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
         exact: quantiles of all rows at once (linear interpolation), not of their histogram.
         video: count the conditioning video's steps too.
-
-    Raises:
-        UserError: fewer than two execution steps.
     """
     steps = _counted_steps(sources, episodes, video)
     if len(steps) < 2:
@@ -65,11 +62,11 @@ def compute_norm_stats(
 
 def _of_letters(stats: QuantileStats, letters: list[int]) -> QuantileStats:
     """Statistics in which these numbers go from 0 to 1: a letter that is seldom chosen would else have no range."""
-    found = stats.to_dict()
+    values = stats.to_dict()
     for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
-        for place in letters if name in found else ():
-            found[name][place] = value
-    return QuantileStats.from_dict(found)
+        for place in letters if name in values else ():
+            values[name][place] = value
+    return QuantileStats.from_dict(values)
 
 
 def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:

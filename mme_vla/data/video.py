@@ -1,8 +1,8 @@
-"""Pictures out of video files, by time stamp, with PyAV.
+"""Images out of video files, by time stamp, with PyAV.
 
 PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's libraries from the
 system and is not used. Files stay open between calls, as many as the process may hold: samples are drawn from all
-episodes at random, and opening a file takes longer than decoding a picture.
+episodes at random, and opening a file takes longer than decoding an image.
 """
 
 import os
@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.files import decoding, files_to_hold
+from mme_vla.utils import decoding, files_to_hold
 
-_SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nearer one is decoded up to
+_SEEK_BEYOND = 64  # images: a target further ahead than this is sought, a nearer one is decoded up to
 
 
 class VideoReader:
-    """Decodes single pictures from a bounded number of open files. Safe across `fork`: a child opens its own."""
+    """Decodes single images from a bounded number of open files. Safe across `fork`: a child opens its own."""
 
     def __init__(self, max_open: int = 512) -> None:
         """Open nothing yet.
@@ -34,55 +34,51 @@ class VideoReader:
         self._may_hold: int | None = None
 
     def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
-        """Return the pictures nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for.
-
-        Raises:
-            UserError: the file cannot be decoded, or holds no picture within half a frame of a time stamp.
-        """
+        """Return the images nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for."""
         order = np.argsort(np.asarray(timestamps), kind="stable")
-        wanted = np.asarray(timestamps, np.float64)[order]
-        pictures: list[np.ndarray] = []
+        targets = np.asarray(timestamps, np.float64)[order]
+        images: list[np.ndarray] = []
         if not path.is_file():
             raise UserError(f"{path} is missing: the dataset is incomplete. Copy or download it again.")
         try:
             with decoding(path, "a video", "Copy or convert it again."):
-                for picture in self._decode(self._container(path), wanted, fps):
-                    pictures.append(picture)
-                if len({picture.shape for picture in pictures}) > 1:
-                    raise ValueError("its pictures are not of one size")
+                for image in self._decode(self._container(path), targets, fps):
+                    images.append(image)
+                if len({image.shape for image in images}) > 1:
+                    raise ValueError("its images are not of one size")
         except UserError:
             self._drop(path)
             raise
-        if len(pictures) < len(wanted):
+        if len(images) < len(targets):
             self._drop(path)
             raise UserError(
-                f"{path} holds no picture at {wanted[len(pictures)]:.3f} s ({fps:g} frames per second): the video is "
+                f"{path} holds no image at {targets[len(images)]:.3f} s ({fps:g} frames per second): the video is "
                 "shorter than the table beside it, or damaged. Copy or convert the dataset again."
             )
-        out = np.empty((len(wanted), *pictures[0].shape), np.uint8)
-        out[order] = pictures
+        out = np.empty((len(targets), *images[0].shape), np.uint8)
+        out[order] = images
         return out
 
     @staticmethod
-    def _decode(container: Any, wanted: np.ndarray, fps: float) -> Iterator[np.ndarray]:
+    def _decode(container: Any, targets: np.ndarray, fps: float) -> Iterator[np.ndarray]:
         stream = container.streams.video[0]
         tolerance, near = 0.5 / fps, _SEEK_BEYOND / fps
         frames: Iterator[Any] = iter(())
-        time, picture = -np.inf, None
-        for target in wanted:
-            if target > time + near or target < time - tolerance or picture is None:
-                # One tick early, so that rounding never lands behind the picture's own key frame.
+        time, image = -np.inf, None
+        for target in targets:
+            if target > time + near or target < time - tolerance or image is None:
+                # One tick early, so that rounding never lands behind the image's own key frame.
                 container.seek(max(round(target / stream.time_base) - 1, 0), stream=stream)
                 frames = container.decode(stream)
-                time, picture = -np.inf, None
+                time, image = -np.inf, None
             while time < target - tolerance:
                 frame = next(frames, None)
                 if frame is None:
                     return
-                time, picture = float(frame.pts * stream.time_base), frame
-            if time > target + tolerance or picture is None:
+                time, image = float(frame.pts * stream.time_base), frame
+            if time > target + tolerance or image is None:
                 return
-            yield picture.to_ndarray(format="rgb24")
+            yield image.to_ndarray(format="rgb24")
 
     def _container(self, path: Path) -> Any:
         import av

@@ -1,4 +1,4 @@
-"""RoboMME's Panda in joint space: the robot of every checkpoint that does not say what robot it is for."""
+"""RoboMME's Panda in joint space: the robot of checkpoints that name none."""
 
 from collections.abc import Mapping, Sequence
 from string import ascii_uppercase
@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment.actions import ActionSpace
-from mme_vla.embodiment.base import Camera, Embodiment, State
-from mme_vla.embodiment.options import MIDDLE
+from mme_vla.embodiment.action_space import MIDDLE, ActionSpace
+from mme_vla.embodiment.robot import Camera, Embodiment, State
 from mme_vla.errors import UserError
 
 ARM_JOINTS = 7
@@ -17,7 +16,7 @@ POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 CAMERAS = ("front", "wrist")
 """What the benchmark's environments show."""
 SIDE = 256
-"""Of the benchmark's pictures, in pixels; points of subgoals and choices are pixels of its front picture."""
+"""Of the benchmark's images, in pixels; points of subgoals and choices are pixels of its front image."""
 LETTERS = "abcdefgh"
 """Of the options that a task can offer."""
 
@@ -43,18 +42,14 @@ ROBOMME_JOINT = Embodiment(
 
 
 def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
-    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots could be chosen.
-
-    Raises:
-        UserError: a section `embodiment` that cannot be, or that does not fit the section `backbone`.
-    """
+    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots could be chosen."""
     backbone = config.get("backbone", {})
     if config.get("embodiment") is None:
         return ROBOMME_JOINT.with_horizon(backbone.get("horizon", ROBOMME_JOINT.action.horizon))
-    found = Embodiment.from_dict(config["embodiment"])
+    robot = Embodiment.from_dict(config["embodiment"])
     if {"action_dim", "horizon"} <= set(backbone):
-        found.check_network(backbone["action_dim"], backbone["horizon"])
-    return found
+        robot.check_network(backbone["action_dim"], backbone["horizon"])
+    return robot
 
 
 def benchmark_action(
@@ -67,7 +62,7 @@ def benchmark_action(
         pose: of the tool now [6], for actions that are differences to it.
 
     Returns:
-        The numbers; or `{"choice": "A", "point": [y, x]}`, in pixels of the front picture.
+        The numbers; or `{"choice": "A", "point": [y, x]}`, in pixels of the front image.
     """
     if space.of_pose and pose is not None:
         action = space.beside_pose(action, pose)
@@ -78,10 +73,10 @@ def benchmark_action(
 
 
 def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
-    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of the picture.
+    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of the image.
 
     Args:
-        letter: `a` to `h`. point: y and x in pixels of the front picture; empty for a choice that needs none.
+        letter: `a` to `h`. point: y and x in pixels of the front image; empty for a choice that needs none.
     """
     row = np.zeros(len(LETTERS) + 2, np.float32)
     row[LETTERS.index(letter)] = 1
@@ -96,11 +91,7 @@ def benchmark_state(joints: Sequence[float] | np.ndarray, fingers: Sequence[floa
 
 
 def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
-    """Make sure that a robot can take part in the benchmark.
-
-    Raises:
-        UserError: it has no action space of `spaces`, other cameras, or another state than the benchmark's.
-    """
+    """Make sure that a robot can take part in the benchmark."""
     if robot.action.space not in spaces:
         raise UserError(
             f"The robot {robot.name!r} cannot be evaluated on the benchmark: its action space is "
@@ -108,8 +99,8 @@ def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
         )
     other = [name for name in robot.camera_names if name not in CAMERAS]
     if other or robot.state.width != ROBOMME_JOINT.state.width:
-        seen = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"
+        difference = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"
         raise UserError(
-            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {seen}, and the benchmark gives "
-            f"the cameras {', '.join(CAMERAS)} and {ROBOMME_JOINT.state.width} numbers."
+            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {difference}, and the benchmark "
+            f"gives the cameras {', '.join(CAMERAS)} and {ROBOMME_JOINT.state.width} numbers."
         )

@@ -6,10 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
     from mme_vla.envs.make import load_tasks, make_env
-    from mme_vla.envs.metadata import EpisodeSpec, episode, episodes
-    from mme_vla.envs.task_names import TASK_NAMES
-    from mme_vla.envs.vector.jobs import Job, Reply
-    from mme_vla.envs.vector.pool import VecEnv, make_vec_env
+    from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec, episode, episodes
+    from mme_vla.envs.vector.pool import Job, Reply, VecEnv, make_vec_env
 
 __all__ = [
     "TASK_NAMES",
@@ -27,10 +25,10 @@ __all__ = [
 
 _HOMES = {
     "EpisodeSpec": "metadata",
-    "Job": "vector.jobs",
-    "Reply": "vector.jobs",
+    "Job": "vector.pool",
+    "Reply": "vector.pool",
     "RoboMMEEnv": "interface",
-    "TASK_NAMES": "task_names",
+    "TASK_NAMES": "metadata",
     "VecEnv": "vector.pool",
     "episode": "metadata",
     "episodes": "metadata",

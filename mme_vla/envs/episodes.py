@@ -1,12 +1,11 @@
-"""Which episodes a command is about: one grammar of `tasks=`, `episodes=` and `split=` for all of them."""
+"""The grammar of `tasks=`, `episodes=` and `split=`, the same for all commands."""
 
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mme_vla.envs import metadata
-from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.registry import TASKS
 
@@ -18,11 +17,8 @@ def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
     """Names of tasks in the order they are named, each once.
 
     Args:
-        tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names; tasks of
-            one's own are named, after the plugin that registers them was imported.
-
-    Raises:
-        UserError: an unknown task, one named twice, or none.
+        tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names. The user's
+            tasks need the plugin that registers them.
     """
     names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
     names = [str(name).strip() for name in names]
@@ -41,83 +37,66 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     Args:
         episodes: None or `all` for all there are, a number for the first so many, a list of numbers, or text of
             numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three alone, `3` the first three.
-        count: how many episodes there are. what: of what, for messages.
-
-    Raises:
-        UserError: a number that there is not, one named twice, none, or another form.
+        count: of episodes in `what`, which messages name.
     """
     if episodes is None or episodes == ALL:
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
         if not 1 <= episodes <= count:
             alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
-            raise UserError(f"episodes={episodes} asks for the first {episodes}; {what} has {count}.{alone}")
+            raise UserError(f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}")
         return list(range(episodes))
-    found = spans(episodes, "episodes", GRAMMAR)
-    for span in found:
+    ranges = spans(episodes, "episodes", GRAMMAR)
+    for span in ranges:
         if span.stop > count:
             raise UserError(f"There is no episode {span.stop - 1} in {what}, which has {count}: 0 to {count - 1}.")
-    numbers = [number for span in found for number in span]
+    numbers = [number for span in ranges for number in span]
     if not numbers or len(set(numbers)) < len(numbers):
         raise UserError(f"episodes={episodes} must name each episode once, and at least one.")
     return numbers
 
 
 def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, split: str = "test") -> list[EpisodeSpec]:
-    """The episodes of a run, task by task.
-
-    Raises:
-        UserError: an unknown task or split, or as `choose_numbers`.
-    """
-    chosen = []
+    """The episodes of a run, task by task."""
+    specs = []
     for task in choose_tasks(tasks):
         known = metadata.episodes(task, split)
-        chosen += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
-    return chosen
+        specs += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
+    return specs
 
 
 def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
-    """What `tasks=` says, or `task=`, which means the same.
-
-    Args:
-        config: a command's; `tasks` is `all` by default where the command needs no tasks, else None.
-
-    Raises:
-        UserError: both are given and differ, or neither is.
-    """
+    """The value of `tasks=`, or of `task=`, which means the same."""
     tasks, task = (config.get(key) for key in ("tasks", "task"))
     if task is not None and tasks not in (None, ALL, task):
         raise UserError(f"tasks={tasks} and task={task} mean the same: give one of them.")
-    given = tasks if task is None else task
-    if given is None:
+    names = tasks if task is None else task
+    if names is None:
         raise UserError("Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
-    return given if isinstance(given, str) else [str(name) for name in given]
+    return names if isinstance(names, str) else [str(name) for name in names]
 
 
-def spans(given: Any, key: str, grammar: str) -> list[range]:
+def spans(value: Any, key: str, grammar: str) -> list[range]:
     """Read numbers and ranges: text such as `0-9` or `0-3,7`, or a list of such.
 
     Args:
-        key: what they were given as, and `grammar` what may stand there, for messages.
-
-    Raises:
-        UserError: another form.
+        key, grammar: for messages.
     """
-    if isinstance(given, str):
-        parts: list[Any] = given.split(",")
-    elif isinstance(given, Sequence):
-        parts = list(given)
+    if isinstance(value, str):
+        parts: list[Any] = value.split(",")
+    elif isinstance(value, Sequence):
+        parts = list(value)
     else:
-        raise UserError(f"{key}={given!r} is not understood; write {grammar}.")
-    return [_span(part, given, key, grammar) for part in parts]
+        raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
+    return [_span(part, value, key, grammar) for part in parts]
 
 
-def _span(part: Any, given: Any, key: str, grammar: str) -> range:
+def _span(part: Any, value: Any, key: str, grammar: str) -> range:
     """The numbers of one part: a number, or `first-last`, both included."""
-    found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
-    if found is None or isinstance(part, bool | float):
-        raise UserError(f"{key}={given!r} is not understood; write {grammar}.")
-    first, last = int(found[1]), int(found[2] or found[1])
+    match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
+    if match is None or isinstance(part, bool | float):
+        raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
+    first, last = int(match[1]), int(match[2] or match[1])
     if first > last:
-        raise UserError(f"{key}={given}: the range {part} ends before it begins.")
+        raise UserError(f"{key}={value}: the range {part} ends before it begins.")
     return range(first, last + 1)

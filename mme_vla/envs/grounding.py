@@ -1,4 +1,4 @@
-"""Where objects are in the front picture, and the sub-task texts that say so."""
+"""Pixels of objects in the front image, and the sub-task texts that contain them."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from mme_vla.envs.subtasks import SubTask
 
 PLACE = "<>"
-"""Stands in a text for the pixel of an object."""
+"""Placeholder in a text for the pixel of an object."""
 
 
 def project(point: np.ndarray) -> np.ndarray:
-    """Pixel [y, x] (float64) of a point [3] of the world in the front picture."""
+    """Pixel [y, x] (float64) of a point [3] of the world in the front image."""
     extrinsic = front_extrinsic().astype(np.float64)
     x, y, depth = INTRINSIC.astype(np.float64) @ (extrinsic @ np.append(np.asarray(point, np.float64), 1.0))
     return np.array([y, x]) / depth
@@ -27,19 +27,16 @@ def centroid(segmentation: np.ndarray, ids: Sequence[int]) -> tuple[int, int] | 
 
     Args:
         segmentation: object ids [height, width].
-        ids: ids of the objects that count as one place.
+        ids: of the objects that share a placeholder.
     """
     rows, columns = np.nonzero(np.isin(segmentation, list(ids)))
     return (int(rows.mean()), int(columns.mean())) if len(rows) else None
 
 
 def ground(text: str, targets: Sequence["Thing"], segmentation: np.ndarray) -> str | None:
-    """Fill each `<>` of a text with the pixel of its object, `<y, x>`; None if one of them is not to be seen.
+    """Fill each `<>` of a text with the pixel of its object, `<y, x>`; None if one of them is hidden.
 
-    One place takes all targets together; several places take one target each, in order.
-
-    Raises:
-        ValueError: the numbers of places and of targets do not fit.
+    A single `<>` takes all targets together; several take one target each, in order.
     """
     places = text.count(PLACE)
     groups = [list(targets)] if places == 1 else [[target] for target in targets]
@@ -57,7 +54,7 @@ class Grounding:
     """The grounded text of an episode's sub-tasks: computed when a sub-task begins, and kept until the next one.
 
     Args:
-        retry: while an object is hidden, look again at each frame; otherwise the plain text is kept.
+        retry: while an object is hidden, try again at each frame; otherwise keep the text without pixels.
     """
 
     def __init__(self, retry: bool = True) -> None:
@@ -75,7 +72,7 @@ class Grounding:
 
         Args:
             subtask: whose text is shown now.
-            segmentation: reads the object ids of the present picture; called only when needed. None: no pictures.
+            segmentation: reads the object ids of the present image; called only when needed. None: no images.
         """
         if subtask is not self._subtask:
             self._subtask, self._text = subtask, None

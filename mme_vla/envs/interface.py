@@ -1,13 +1,13 @@
-"""The environment a policy meets: official observation lists, info keys and statuses around one simulated task.
+"""The environment of one episode: official observation lists, info keys and statuses around one simulated task.
 
-`reset` runs the conditioning video and returns all of its frames followed by the present one; `step` returns one frame,
-or all frames of the motion in the action spaces that plan. Images appear only when the environment renders.
+`reset` simulates the conditioning video and returns all of its frames followed by the present one. `step` returns one
+frame, or all frames of the motion in the action spaces that plan. Images appear only when the environment renders.
 """
 
 import logging
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -15,16 +15,21 @@ import numpy as np
 import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding
-from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
-from mme_vla.envs.rewards import earned_by
+from mme_vla.envs.observations import (
+    INTRINSIC,
+    Include,
+    Observer,
+    RenderRequest,
+    as_lists,
+    frame_keys,
+    observation_space,
+)
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
-from mme_vla.envs.saved_state import EpisodeState, play_again
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
-from mme_vla.envs.subtasks import NO_RECORD
-from mme_vla.errors import UserError
+from mme_vla.envs.subtasks import NO_RECORD, REWARDS
+from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from mme_vla.envs.subtasks import SubTask
@@ -34,7 +39,39 @@ log = logging.getLogger(__name__)
 
 FrameHook = Callable[[dict[str, Any], dict[str, Any], bool], None]
 """Called with each returned frame, its info, and whether it belongs to the conditioning video."""
-_MARGIN = 2  # The benchmark counts two steps more than the limit it is given.
+_MARGIN = 2  # The benchmark counts two steps more than its limit.
+_CLOSED = "The environment is closed; make a new one."
+
+
+@dataclass(frozen=True)
+class EpisodeState:
+    """The state of an episode as its scene and its actions: a replay restores it, to the last bit on one CPU type.
+
+    Positions and velocities are not enough: contacts, the solver's last solution and the script's variables belong to
+    the state as well. A replay without images takes about two milliseconds a control step. Can be pickled.
+
+    task, seed, difficulty, recovery, in_view, stress: the scene. action_space, max_steps: of the environment.
+    options: of the reset. actions: all that were given to `step` since.
+    """
+
+    task: str
+    seed: int
+    difficulty: str
+    recovery: str | None
+    in_view: bool
+    stress: dict[str, int]
+    action_space: str
+    max_steps: int
+    options: dict[str, Any]
+    actions: tuple[Any, ...]
+
+    def check(self, other: "EpisodeState") -> None:
+        """Make sure that an environment whose own state is `other` can continue from here."""
+        names = [field.name for field in fields(self) if field.name not in ("options", "actions")]
+        pairs = [(name, getattr(self, name), getattr(other, name)) for name in names]
+        differences = ", ".join(f"{name} {value!r} (here {here!r})" for name, value, here in pairs if value != here)
+        if differences:
+            raise UserError(f"This state is of another environment: {differences}. Make one of the same episode.")
 
 
 @dataclass
@@ -42,26 +79,25 @@ class _Run:
     """One episode under way."""
 
     control: Control
-    shown: "SubTask"
+    displayed: "SubTask"
     """Whose text describes the present frame."""
     last_action: np.ndarray
     in_video: bool = True
     frames: list[dict[str, Any]] = field(default_factory=list)
-    """Those that the present call hands out."""
+    """Those that the present call returns."""
     newest: dict[str, Any] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     returned: int = 0
-    """Frames handed out since the reset."""
+    """Frames returned since the reset."""
     count: int = 0
     """Control steps that count towards the limit."""
-    earned: float = 0.0
-    """What the reward has given so far."""
+    total_reward: float = 0.0
     options: dict[str, Any] = field(default_factory=dict)
     actions: list[Any] = field(default_factory=list)
-    """Of the reset, and all since: what the episode can be played again from."""
-    told: str = ""
+    """All since the reset."""
+    subgoal_text: str = ""
     began: list[int] = field(default_factory=list)
-    """Frames at which another sub-task was told."""
+    """Frames at which the sub-task's text changed."""
     terminated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
     truncated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
 
@@ -69,24 +105,21 @@ class _Run:
 class RoboMMEEnv(gymnasium.Env):
     """One episode's environment with the official interface.
 
-    `step` never raises for what an action brings about: a malformed action, an unreachable pose or a simulator error
+    `step` does not raise: a malformed action, an unreachable pose or a simulator error
     ends the episode with `info["status"] == "error"`. After the end of an episode further steps are simulated as the
     benchmark does, so that recorded action sequences can be replayed to their last action.
 
     Args:
-        task: the simulated task, created with the observation mode `none` (or, for `maniskill_obs`, the wanted one).
+        task: the simulated task, created with the observation mode `none` (or, for `maniskill_obs`, another).
         action: name of the action space.
         max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
-        reward: `none`, as in the benchmark, `sparse` or `subtask` (`mme_vla.envs.rewards`).
+        reward: `none`, as in the benchmark, `sparse` or `subtask` (`mme_vla.envs.subtasks`).
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.
-        drawing: which frames have pictures, from the next call on; None for all. The others' are None in the lists.
-
-    Raises:
-        UserError: an unknown action space or reward, or a limit that is no positive integer.
+        render_request: which frames have images, from the next call on; None for all. The others' are None.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -102,11 +135,13 @@ class RoboMMEEnv(gymnasium.Env):
     ) -> None:
         if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
             raise UserError(f"max_steps is {max_steps!r}; expected a positive integer.")
-        self._space, self._earned = action_space(action), earned_by(reward)
+        if reward not in REWARDS:
+            raise UserError(f"Unknown reward {reward!r}. {did_you_mean(str(reward), REWARDS)}")
+        self._space, self._total_reward = action_space(action), REWARDS[reward]
         self.include = include or Include()
         self.max_steps = max_steps
         self.on_frame: FrameHook | None = None
-        self.drawing: Drawing | None = None
+        self.render_request: RenderRequest | None = None
         self.render_mode = "rgb_array" if render else None
         self.action_space = self._space.space(task.stick)
         self._keys = frame_keys(self.include, render)
@@ -116,8 +151,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._task: Task | None = task
         self._observer = Observer(task, self.include, render)
         self._muted = True
-        # Frames are made where the simulator makes observations: after physics and evaluation, before the script.
-        task.get_obs = self._on_observation  # type: ignore[method-assign]
+        task.on_frame = self._on_frame
         self._episodes = 0
         self._run: _Run | None = None
 
@@ -135,11 +169,8 @@ class RoboMMEEnv(gymnasium.Env):
 
         Returns:
             Observation lists (conditioning video, then the present frame) and the info of the present frame.
-
-        Raises:
-            UserError: the environment is closed, or an option is not known.
         """
-        task = self._open_task()
+        task = self.task
         options = {"video": True} | (options or {})
         if len(options) > 1:
             raise UserError(f"Unknown reset options {sorted(options.keys() - {'video'})}; there is only 'video'.")
@@ -150,7 +181,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._muted = False
         self._episodes += 1
         control = Control(task, self._step_control, Demonstrator(task, self._step_control))
-        run = self._run = _Run(control, task.progress.shown, task.reset_action, options=options)
+        run = self._run = _Run(control, task.progress.displayed, task.reset_action, options=options)
         self._grounding.clear()
         self._observer.start()
         for subtask in task.progress.subtasks:
@@ -170,11 +201,7 @@ class RoboMMEEnv(gymnasium.Env):
             Observation lists, reward, terminated, truncated (0-d tensors) and the info of the last frame.
             After an exception `(None, 0.0, True, False, info)` with the status `error`; after failed inverse kinematics
             the observation is `{}`.
-
-        Raises:
-            UserError: the environment is closed, or was never reset.
         """
-        self._open_task()
         run = self._require_run()
         run.frames = []
         run.actions.append(deepcopy(action))
@@ -193,32 +220,44 @@ class RoboMMEEnv(gymnasium.Env):
         return observation, reward, run.terminated, run.truncated, dict(run.info)
 
     def save_state(self) -> EpisodeState:
-        """Where the running episode stands, for `restore_state`; it costs next to nothing.
-
-        Raises:
-            UserError: the environment is closed, or was never reset.
-        """
+        """The state of the running episode, for `restore_state`; costs next to nothing."""
         run = self._require_run()
-        return self.state_of(run.options, run.actions)
+        return self._state(run.options, run.actions)
+
+    def _state(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
+        task = self.task
+        scene = type(task).__name__, task.seed, task.difficulty, task.recovery, task.in_view, task.stress
+        return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
 
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
-        """Go on from a saved state of the same episode, whichever environment it is of; as if nothing had been between.
+        """Continue from a saved state of the same episode, which may come from another environment or process.
 
-        The episode is played again, without pictures but of the present frame and where a text needs a pixel. Nothing
-        of it reaches `on_frame`.
+        Replays the episode. Renders only the newest frame and those whose pixels a text needs; `on_frame` is not
+        called.
 
         Returns:
-            Observation lists and info, as the last `reset` or `step` before `save_state` returned them, pictures of the
+            Observation lists and info, as the last `reset` or `step` before `save_state` returned them, images of the
             newest frame alone.
-
-        Raises:
-            UserError: the state is of another scene, action space or limit, or the environment is closed.
         """
-        return play_again(self, state)
+        state.check(self._state({}, ()))
+        hook, request = self.on_frame, self.render_request
+        grounded = request is None or request.grounded
+        hidden, newest = RenderRequest({}, now=(), grounded=grounded), RenderRequest({}, grounded=grounded)
+        self.on_frame = None
+        try:
+            self.render_request = hidden if state.actions else newest
+            observation, info = self.reset(options=state.options)
+            for number, action in enumerate(state.actions, 1):
+                self.render_request = hidden if number < len(state.actions) else newest
+                observation, _, _, _, info = self.step(action)
+        finally:
+            self.on_frame, self.render_request = hook, request
+        return observation, info
 
     def render(self) -> np.ndarray | None:
-        """The newest front picture [256, 256, 3]; None if it was not drawn, or before the first reset."""
-        self._open_task()
+        """The newest front image [256, 256, 3]; None if it was not rendered, or before the first reset."""
+        if self._task is None:
+            raise UserError(_CLOSED)
         return None if self._run is None else self._run.newest.get("front_rgb")
 
     def close(self) -> None:
@@ -230,12 +269,14 @@ class RoboMMEEnv(gymnasium.Env):
     @property
     def task(self) -> "Task":
         """The simulated task."""
-        return self._open_task()
+        if self._task is None:
+            raise UserError(_CLOSED)
+        return self._task
 
     @property
     def difficulty(self) -> str:
-        """`easy`, `medium` or `hard`; the released evaluation script asks for it."""
-        return self._open_task().difficulty
+        """`easy`, `medium` or `hard`; read by the released evaluation script."""
+        return self.task.difficulty
 
     @property
     def began(self) -> list[int]:
@@ -249,35 +290,36 @@ class RoboMMEEnv(gymnasium.Env):
 
     # One control step ---------------------------------------------------------------------------------------------
 
-    def _on_observation(self, info: dict[str, Any] | None = None, unflattened: bool = False) -> dict[str, Any]:
-        if self._muted or info is None:
-            return {}
+    def _on_frame(self, evaluated: dict[str, Any]) -> None:
+        if self._muted:
+            return
         run = self._require_run()
         self._observer.follow()
-        if run.in_video and run.shown.text == NO_RECORD:
-            return {}  # neither rendered nor returned
+        if run.in_video and run.displayed.text == NO_RECORD:
+            return  # neither rendered nor returned
         cameras: tuple[str, ...] = tuple(CAMERAS)
-        if self.drawing is not None:
-            cameras = self.drawing.cameras(run.returned, newest=not run.in_video and not run.control.demonstrator.left)
-        frame = run.newest = self._observer.frame(info, cameras)
-        if run.shown.text != run.told:
+        if self.render_request is not None:
+            cameras = self.render_request.cameras(
+                run.returned, newest=not run.in_video and not run.control.demonstrator.left
+            )
+        frame = run.newest = self._observer.frame(evaluated, cameras)
+        if run.displayed.text != run.subgoal_text:
             run.began.append(run.returned)
-            run.told = run.shown.text
+            run.subgoal_text = run.displayed.text
         run.returned += 1
-        run.info = self._info(run, info)
+        run.info = self._info(run, evaluated)
         run.frames.append(frame)
         if self.on_frame is not None:
             self.on_frame(frame, run.info, run.in_video)
-        return {}
 
     def _step_control(self, action: np.ndarray) -> None:
-        task, run = self._open_task(), self._require_run()
+        task, run = self.task, self._require_run()
         run.count += not run.in_video
-        # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to. The
-        # video shows what is being demonstrated where either of the two has no words.
-        run.shown, demonstrated = task.progress.shown, task.progress.demonstrated
-        if run.in_video and NO_RECORD in (run.shown.text, demonstrated.text):
-            run.shown = demonstrated
+        # A frame has the text of the sub-task in which its step was made, not of the next one. In the video it has the
+        # text of the demonstrated sub-task where one of the two has none.
+        run.displayed, demonstrated = task.progress.displayed, task.progress.demonstrated
+        if run.in_video and NO_RECORD in (run.displayed.text, demonstrated.text):
+            run.displayed = demonstrated
         run.last_action = np.asarray(action, np.float32)
         _, _, terminated, _, _ = task.step(run.last_action)
         run.terminated = terminated.reshape(-1)[0].clone()
@@ -288,54 +330,45 @@ class RoboMMEEnv(gymnasium.Env):
         self._evaluate()
         try:
             subtask.run(self._require_run().control.demonstrator)
-        except PlanningError as error:  # the benchmark goes on with the rest of the video
+        except PlanningError as error:  # the benchmark continues with the rest of the video
             log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
         self._evaluate()
 
     def _evaluate(self) -> None:
-        task = self._open_task()
-        task.evaluate()
-        task.progress.planned = task.progress.index
+        self.task.evaluate()
+        self.task.progress.planned = self.task.progress.index
 
     def _settle(self) -> None:
-        """One more step with the same action, which nobody sees, as the benchmark takes at the end of an episode."""
+        """Repeat the last action once without a frame, as the benchmark does at the end of an episode."""
         self._muted = True
         try:
-            self._open_task().step(self._require_run().last_action)
+            self.task.step(self._require_run().last_action)
         finally:
             self._muted = False
 
-    # What it is made of ------------------------------------------------------------------------------------------
-
-    def state_of(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
-        """This environment's episode after these actions."""
-        task = self._open_task()
-        scene = type(task).__name__, task.seed, task.difficulty, task.recovery, task.in_view, task.stress
-        return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
-
     def _reward(self, run: _Run) -> torch.Tensor:
-        """What the present step adds to what the episode has earned."""
+        """Increase of the return in the present step."""
         success = bool(run.info.get("success", False))
-        before, run.earned = run.earned, self._earned(self._open_task().progress, success)
-        return torch.tensor(run.earned - before)
+        before, run.total_reward = run.total_reward, self._total_reward(self.task.progress, success)
+        return torch.tensor(run.total_reward - before)
 
-    # What is handed out -------------------------------------------------------------------------------------------
+    # Info and status ---------------------------------------------------------------------------------------------
 
     def _info(self, run: _Run, evaluated: dict[str, Any]) -> dict[str, Any]:
-        task = self._open_task()
-        shown = run.shown
+        task = self.task
+        subtask = run.displayed
         success, fail = evaluated["success"].clone(), evaluated["fail"].clone()
         info: dict[str, Any] = {
             "task_goal": list(task.goals()),
-            "simple_subgoal_online": shown.text,
+            "simple_subgoal_online": subtask.text,
             "status": self._status(run, bool(success), bool(fail)),
             "success": success,
             "fail": fail,
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
         }
-        if self.drawing is None or self.drawing.grounded:
-            look = self._observer.segmentation if self._render else None
-            info["grounded_subgoal_online"] = self._grounding.update(shown, look)
+        if self.render_request is None or self.render_request.grounded:
+            segmentation = self._observer.segmentation if self._render else None
+            info["grounded_subgoal_online"] = self._grounding.update(subtask, segmentation)
         if self.include.available_multi_choices or self._space.name == "multi_choice":
             info["available_multi_choices"] = [
                 {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}
@@ -356,10 +389,5 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _require_run(self) -> _Run:
         if self._run is None:
-            raise UserError("step() before reset(): call reset() first.")
+            raise UserError(_CLOSED if self._task is None else "step() before reset(): call reset() first.")
         return self._run
-
-    def _open_task(self) -> "Task":
-        if self._task is None:
-            raise UserError("The environment is closed; make a new one.")
-        return self._task

@@ -4,15 +4,17 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mme_vla.envs import metadata
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.envs.variants import read_variant
+from mme_vla.envs.metadata import TASK_NAMES, read_variant
+from mme_vla.envs.observations import Include
 from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.registry import TASKS
 
 if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.official import OfficialEnv
+
 
 ENVS = ("mme_vla", "official")
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
@@ -45,15 +47,14 @@ def make_env(
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
-        recovery: `z` or `xy`: draw what recovery demonstrations draw in addition, as train episodes 0-5 were recorded
-            (it changes the order of BinFill's colours); by default nothing, as in the official evaluation.
+        recovery: `z` or `xy`: sample as recovery demonstrations do, such as train episodes 0-5 (it changes the order of
+            BinFill's colours); by default nothing, as in the official evaluation.
         max_steps: control steps until the status becomes `timeout`.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
             share for each sub-task of the execution as it is done, 1 in all.
         env: `mme_vla`, or `official` for the installed package `robomme`.
-        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` asks for; an
-            environment alone has no memory to show them to.
+        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
             `include_available_multi_choices`, `include_maniskill_obs`.
@@ -67,8 +68,6 @@ def make_env(
     check_names(task, env, action_space, difficulty, seed)
     check_sessions(split, sessions)
     if env == "official":
-        from mme_vla.envs.official import make_official_env
-
         if seed is not None or recovery is not None or not render or reward != "none":
             raise UserError(
                 'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, '
@@ -81,32 +80,24 @@ def make_env(
         seed, difficulty = spec.seed, spec.difficulty
         varied = metadata.check_split(split)
         variant = {} if varied is None else varied.options
-    return _make_own(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
+    return _make_library_env(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
                      recovery=recovery, **variant)  # fmt: skip
 
 
-def check_sessions(split: str, shown: int) -> None:
-    """Refuse a split with sessions before each episode where nobody shows them.
-
-    Raises:
-        UserError: fewer or more are shown than the split asks for.
-    """
+def check_sessions(split: str, sessions: int) -> None:
+    """Refuse a split with sessions before each episode unless the caller shows them."""
     variant = read_variant(split)
-    wanted = 0 if variant is None else variant.sessions
-    if wanted != shown:
+    required = 0 if variant is None else variant.sessions
+    if required != sessions:
         raise UserError(
-            f"split={split}: {wanted} unrelated episodes come before each, and {shown} are shown. `python -m "
-            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; whoever shows them "
-            "otherwise says so: make_env(…, sessions=2)."
+            f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
+            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
+            "callers declare them: make_env(…, sessions=2)."
         )
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
-    """Refuse what can be refused without the simulator.
-
-    Raises:
-        UserError: an unknown task, environment, action space or difficulty, or a difficulty without a seed.
-    """
+    """Refuse what can be refused without the simulator."""
     if task not in TASK_NAMES and task not in TASKS:
         raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
     for kind, value, known in (("environment", env, ENVS), ("action space", action_space, ACTION_SPACES)):
@@ -119,11 +110,7 @@ def check_names(task: str, env: str, action_space: str, difficulty: str | None, 
 
 
 def require_simulator() -> None:
-    """Refuse to go on without the simulator's packages.
-
-    Raises:
-        UserError: mani-skill is not installed.
-    """
+    """Refuse to continue without the simulator's packages."""
     if find_spec("mani_skill") is None:
         raise missing_extra("The simulator", "sim")
 
@@ -133,9 +120,6 @@ def load_tasks(*tasks: str) -> None:
 
     >>> load_tasks()  # doctest: +SKIP
     >>> gymnasium.make("StopCube", seed=0, difficulty="easy", obs_mode="rgb")  # doctest: +SKIP
-
-    Raises:
-        UserError: the simulator is missing.
     """
     require_simulator()
     from mme_vla.envs.tasks import module_name
@@ -152,9 +136,6 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
         render: build what is there to be seen; otherwise no Vulkan is needed.
         obs_mode: ManiSkill's observation mode.
         options: `seed`, `difficulty`, `recovery`, and what ManiSkill's `BaseEnv` takes.
-
-    Raises:
-        UserError: the simulator is missing, rendering is not possible here, or no such task is registered.
     """
     if task in TASK_NAMES:
         load_tasks(task)
@@ -162,19 +143,17 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
         require_simulator()
     backend = "none"
     if render:
-        from mme_vla.envs.rendering_check import render_backend
+        from mme_vla.envs.rendering import render_backend
 
         backend = render_backend()
     return TASKS[task](obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options)
 
 
-def _make_own(
+def _make_library_env(
     task: str, space: str, max_steps: int, render: bool, reward: str, options: dict[str, Any], **scene: Any
 ) -> "RoboMMEEnv":
-    from mme_vla.envs.observations import Include
-
     if space == "multi_choice":
-        # Who chooses a pixel needs the front camera to know what it shows.
+        # A policy that chooses a pixel needs the front camera's matrices.
         options = options | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
     include = Include.from_options(options)
     obs_mode = "none"
@@ -185,3 +164,92 @@ def _make_own(
 
     built = make_task(task, render=render, obs_mode=obs_mode, **scene)
     return RoboMMEEnv(built, space, max_steps, include, render, reward)
+
+
+class OfficialEnv:
+    """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
+
+    The package needs a patched simulator, numpy < 2 and gymnasium 0.29, therefore an environment of its own.
+
+    Args:
+        env: what the official builder made.
+        max_steps: control steps after which the status becomes `timeout`.
+        include: what observations and infos hold beyond the standard keys.
+    """
+
+    def __init__(self, env: Any, max_steps: int, include: Include) -> None:
+        self._env: Any = env
+        self.max_steps = max_steps
+        self.include = include
+        self._newest: np.ndarray | None = None
+        self._started = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+        """Begin the episode; `seed` and `options` have no effect."""
+        observation, info = self._open().reset()
+        self._started = True
+        self._keep_newest(observation)
+        return observation, _flat(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Perform one action."""
+        env = self._open()
+        if not self._started:
+            raise UserError("step() before reset(): call reset() first.")
+        observation, reward, terminated, truncated, info = env.step(action)
+        self._keep_newest(observation)
+        return observation, reward, terminated, truncated, _flat(info)
+
+    def render(self) -> np.ndarray | None:
+        """The newest front image [256, 256, 3], or None before the first reset."""
+        self._open()
+        return self._newest
+
+    def close(self) -> None:
+        """Free the simulator; closing twice is harmless."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _open(self) -> Any:
+        if self._env is None:
+            raise UserError("The environment is closed; make a new one.")
+        return self._env
+
+    def _keep_newest(self, observation: Any) -> None:
+        if observation and observation.get("front_rgb_list"):
+            self._newest = np.asarray(observation["front_rgb_list"][-1])
+
+
+def make_official_env(
+    task: str, split: str, episode: int, action_space: str, max_steps: int, options: dict[str, Any]
+) -> OfficialEnv:
+    """Make an episode of the official package."""
+    include = Include.from_options(options)
+    if find_spec("robomme") is None:
+        raise UserError(
+            "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
+            "environment of its own: it needs numpy < 2 and gymnasium 0.29. Or use env='mme_vla', which needs none."
+        )
+    if hasattr(import_module("robomme"), "STANDS_IN"):
+        raise UserError(
+            "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those "
+            "of env='mme_vla'. Uninstall it and install the official one, or leave out env='official'."
+        )
+    import_module("robomme.robomme_env")  # registers the tasks
+    builder = import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder(
+        env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps
+    )
+    count = builder.get_episode_num()
+    if not 0 <= episode < count:
+        raise UserError(f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
+    flags = {name: True for name, yes in include.options.items() if yes}
+    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags), max_steps, include)
+
+
+def _flat(info: dict[str, Any]) -> dict[str, Any]:
+    """The info as one plain dict whose `task_goal` is a list."""
+    goal = info.get("task_goal")
+    return {**info, "task_goal": [goal]} if isinstance(goal, str) else dict(info)

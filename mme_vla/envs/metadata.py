@@ -1,13 +1,14 @@
-"""Which seed and difficulty every episode of the benchmark's splits has; importing this needs no simulator.
+"""Tasks, splits, and the seed and difficulty of every episode; importing this needs no simulator.
 
 The shipped tables are the benchmark's own. A seed follows from task, split and episode by a formula, except where the
-official demonstrator failed on it and the seed was raised until it succeeded (benchmarks/episode_seeds.py does the same
-with ours, and reports where it comes out elsewhere). With the official files at hand (the `robomme` package installed,
-or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`) theirs are used.
+official demonstrator failed on it and the seed was raised until it succeeded (see benchmarks/episode_seeds.py). The
+official files are preferred: the installed package `robomme`, or the folder with `train/`, `val/` and `test/` that
+`MME_VLA_ROBOMME_METADATA` names.
 """
 
 import csv
 import os
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
@@ -15,21 +16,98 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.envs.variants import BASE, STRESS, TWIN, Variant, read_variant
 from mme_vla.errors import UserError, brief, did_you_mean
-from mme_vla.files import read_json
 from mme_vla.registry import TASKS
+from mme_vla.utils import read_json
+
+TASK_NAMES = (
+    "PickXtimes", "StopCube", "SwingXtimes", "BinFill",
+    "VideoUnmaskSwap", "VideoUnmask", "ButtonUnmaskSwap", "ButtonUnmask",
+    "VideoRepick", "VideoPlaceButton", "VideoPlaceOrder", "PickHighlight",
+    "InsertPeg", "MoveCube", "PatternLock", "RouteStick",
+)  # fmt: skip
+"""In the benchmark's order, which the seeds of the episodes follow."""
+
+STICK_TASKS = ("PatternLock", "RouteStick")
+"""Tasks whose robot holds a stick instead of a gripper."""
+
+BASE = "test"
+TWIN, STRESS = "twin", "stress"
+DIALS: dict[str, tuple[str, ...]] = {
+    "count": ("PickXtimes", "SwingXtimes", "StopCube", "VideoRepick"),
+    "containers": ("VideoUnmask", "ButtonUnmask"),
+    "swaps": ("VideoUnmaskSwap", "ButtonUnmaskSwap"),
+    "delay": ("VideoUnmask", "VideoUnmaskSwap", "VideoPlaceButton", "VideoPlaceOrder", "VideoRepick", "MoveCube"),
+    "path": ("PatternLock",),
+    "distractors": ("PickHighlight",),
+}
+"""Dial → the tasks that have it.
+
+count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps more between
+what is shown and the execution. path: discs more on the way. distractors: more objects that are not targets.
+"""
+SESSIONS = "sessions"
+"""Unrelated episodes before the actual one, in the same memory: a dial of all tasks that leaves scenes unchanged."""
+_STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How the scenes of a split differ from the test split's. dial, turned: of a stress split."""
+
+    twin: bool = False
+    dial: str = ""
+    turned: int = 0
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of the task."""
+        if self.twin:
+            return {"in_view": True}
+        return {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
+
+    @property
+    def sessions(self) -> int:
+        """Unrelated episodes that come before each."""
+        return self.turned if self.dial == SESSIONS else 0
+
+    def check(self, task: str) -> None:
+        """Make sure that a task of the benchmark can be varied so."""
+        if task not in TASK_NAMES:
+            raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
+        if self.dial and self.dial != SESSIONS and task not in DIALS[self.dial]:
+            dials = [dial for dial, tasks in DIALS.items() if task in tasks]
+            raise UserError(
+                f"{task} has no dial {self.dial!r}; it has {', '.join(dials) or 'none'}. {self.dial} is for "
+                f"{', '.join(DIALS[self.dial])}."
+            )
+
+
+def read_variant(split: str) -> Variant | None:
+    """The variant that a split names; None for any other text."""
+    if split == TWIN:
+        return Variant(twin=True)
+    if not str(split).startswith(STRESS):
+        return None
+    match, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
+    if match is None:
+        raise UserError(
+            f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(known)}."
+        )
+    if match[1] not in known:
+        raise UserError(f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}")
+    return Variant(dial=match[1], turned=int(match[2]))
+
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split."""
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
 FURTHER, FURTHER_EPISODES = "further", 100
-"""Episodes that go on where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
+"""Episodes that continue where the test split's rule ends, for tests on new scenes; no split either."""
 _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
-"""Episodes a task has in each of these; `further_hard` are the hard ones as the same rule goes on, and so forth."""
+"""Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
 _COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS}
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _TEST_SEED = (500_000, 10_000)
@@ -38,7 +116,6 @@ _FIRST_SEED = {
     **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
 }  # fmt: skip
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
-_PACKAGE_FOLDER = Path("env_metadata")
 
 
 @dataclass(frozen=True)
@@ -66,13 +143,13 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
 
 
 def _further_place(split: str, episode: int) -> int:
-    """Where in the rule of seeds and difficulties an episode beyond the test split stands."""
+    """Index, in the rule of seeds and difficulties, of an episode beyond the test split."""
     first, level = SPLITS["test"], split.removeprefix(FURTHER).removeprefix("_")
     if not level:
         return first + episode
-    round_, rest = divmod(episode, _CYCLE.count(level))
+    round_, index = divmod(episode, _CYCLE.count(level))
     places = [place for place in range(first, first + len(_CYCLE)) if _CYCLE[place % len(_CYCLE)] == level]
-    return places[rest] + round_ * len(_CYCLE)
+    return places[index] + round_ * len(_CYCLE)
 
 
 def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
@@ -80,15 +157,12 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`,
+        split: `train`, `val` or `test`; a variant of the latter (`Variant`), whose seeds are the same; or `more`,
             900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
             gives after its own 50 (number 0 is what number 50 would be; no seed was raised), or `further_easy`,
             `further_medium`, `further_hard`, 400 of one difficulty by the same rule.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
-
-    Raises:
-        UserError: an unknown task or split, or a folder without the file, or a file that is not of that layout.
     """
     if task not in TASK_NAMES and task not in TASKS:
         raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
@@ -108,11 +182,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
 
 def check_split(split: str) -> Variant | None:
-    """Make sure that a split exists; what it varies, where it is a variant of the test split.
-
-    Raises:
-        UserError: there is no such split.
-    """
+    """Make sure that a split exists; returns its variant where it has one."""
     variant = read_variant(split)
     if variant is None and split not in _COUNTS:
         raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), [*_COUNTS, TWIN, STRESS])}")
@@ -120,11 +190,7 @@ def check_split(split: str) -> Variant | None:
 
 
 def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:
-    """One episode of a split.
-
-    Raises:
-        UserError: as `episodes`, or an episode number the split does not have.
-    """
+    """One episode of a split."""
     known = episodes(task, split, folder)
     if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(known):
         raise UserError(f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
@@ -144,8 +210,8 @@ def _table(split: str) -> dict[str, list[EpisodeSpec]]:
 
 def _installed_folder() -> Path | None:
     spec = find_spec("robomme")
-    places = (spec.submodule_search_locations or []) if spec is not None else []
-    return next((Path(place) / _PACKAGE_FOLDER for place in places), None)
+    folders = (spec.submodule_search_locations or []) if spec is not None else []
+    return next((Path(folder) / "env_metadata" for folder in folders), None)
 
 
 def _file(folder: Path, task: str, split: str) -> Path:
@@ -159,9 +225,9 @@ def file_name(task: str) -> str:
 
 def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
     """Episode, seed and difficulty of one official record."""
-    found: dict[str, Any] = record if isinstance(record, dict) else {}
-    numbers: list[Any] = [found.get("episode"), found.get("seed")]
-    difficulty: Any = found.get("difficulty")
+    fields: dict[str, Any] = record if isinstance(record, dict) else {}
+    numbers: list[Any] = [fields.get("episode"), fields.get("seed")]
+    difficulty: Any = fields.get("difficulty")
     if not all(type(n) is int and 0 <= n < 2**31 for n in numbers) or difficulty not in list(_CYCLE):
         raise UserError(
             f"{path} is not official metadata: a record has episode {brief(numbers[0])}, seed {brief(numbers[1])} and "
@@ -172,11 +238,7 @@ def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
 
 
 def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
-    """The episodes that an official metadata file describes, in order.
-
-    Raises:
-        UserError: the file is missing, or of another layout.
-    """
+    """The episodes that an official metadata file describes, in order."""
     records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
     if not isinstance(records, list) or not records:
         raise UserError(f"{path} is not official metadata: it has no list of records. Get the file again.")

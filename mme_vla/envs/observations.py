@@ -1,24 +1,47 @@
-"""What a policy sees of a task: robot state and camera pictures of one frame, and only what was asked for.
+"""The frames of a task: robot state and the requested camera images.
 
 A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Container, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from mme_vla.embodiment.robomme import ARM_JOINTS, SIDE
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
+    import gymnasium
     import sapien
 
     from mme_vla.envs.task import Task
+
+
+NOTHING: Container[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """The frames of an episode that are rendered: a control step costs milliseconds, an image of it some fifty.
+
+    frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on, those of the
+        conditioning video first. A `range` may reach beyond the episode's end.
+    now: the cameras that show, whatever its number, the newest frame of each call of `reset` and `step`.
+    grounded: whether texts need pixels, for which the front camera renders where a sub-task begins.
+    """
+
+    frames: Mapping[str, Container[int]] = field(default_factory=dict)
+    now: tuple[str, ...] = CAMERAS
+    grounded: bool = True
+
+    def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
+        """The cameras that show a frame of this number."""
+        known = dict.fromkeys((*CAMERAS, *self.frames, *self.now))  # some environments have more than the benchmark
+        return tuple(c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now))
+
 
 FOCAL_LENGTH = SIDE / 2  # pixels: the side is seen under 90 degrees
 INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], [0, 0, 1]], np.float32)
@@ -44,11 +67,7 @@ class Include:
 
     @classmethod
     def from_options(cls, options: dict[str, Any]) -> "Include":
-        """Read `include_front_depth=True` and the like.
-
-        Raises:
-            UserError: an option that does not exist, or a value that is not a bool.
-        """
+        """Read `include_front_depth=True` and the like."""
         known = {f"include_{field.name}" for field in fields(cls)}
         for name, value in options.items():
             if name not in known:
@@ -64,7 +83,7 @@ class Include:
 
 
 class AngleTrack:
-    """Roll, pitch and yaw that go on where the previous frame's left off instead of jumping by a full turn.
+    """Roll, pitch and yaw that continue where the previous frame's left off instead of jumping by a full turn.
 
     Extrinsic x-y-z angles; the quaternion's sign follows the previous frame's, and each angle's change is folded into
     [-π, π) and added, so that values may leave ±π.
@@ -80,6 +99,8 @@ class AngleTrack:
 
     def follow(self, quaternion: np.ndarray) -> np.ndarray:
         """Angles [3] float64 of the next frame, from its quaternion [4] (w, x, y, z)."""
+        from scipy.spatial.transform import Rotation
+
         q = np.asarray(quaternion, np.float64)
         q = q / np.linalg.norm(q)
         if self._quaternion is not None and q @ self._quaternion < 0:
@@ -98,7 +119,7 @@ class Observer:
     Args:
         task: the simulated task.
         include: what the frames hold beyond the standard keys.
-        render: take pictures; without it frames hold the robot's state only.
+        render: take images; without it frames hold the robot's state only.
     """
 
     def __init__(self, task: "Task", include: Include, render: bool) -> None:
@@ -120,10 +141,10 @@ class Observer:
         self._eef = np.concatenate([pose.p, self._angles.follow(pose.q)]).astype(np.float64)
 
     def frame(self, info: dict[str, Any], cameras: Collection[str] = tuple(SENSORS)) -> dict[str, Any]:
-        """The present moment; `info` is what the task has just evaluated.
+        """The present frame; `info` is what the task has just evaluated.
 
         Args:
-            cameras: those that take a picture; the others' are None.
+            cameras: those that take an image; the others' are None.
         """
         self._taken = set()
         qpos = self.task.qpos
@@ -133,51 +154,55 @@ class Observer:
             "gripper_state": np.zeros(2) if self.task.stick else qpos[-2:].astype(np.float32),
         }
         if self.include.maniskill_obs:
-            frame["maniskill_obs"] = type(self.task).get_obs(self.task, info)
+            frame["maniskill_obs"] = self.task.simulator_obs(info)
             self._taken |= set(SENSORS)
         elif self.render:
-            self._take_pictures(cameras)
-        for name, camera in SENSORS.items():
+            self._render_cameras(cameras)
+        for name in SENSORS:
             if self.render:
                 depth = getattr(self.include, f"{name}_depth")
-                seen = name in cameras
-                images = self._read(camera, rgb=True, depth=depth) if seen else {}
+                is_rendered = name in cameras
+                images = read_images(self.task, name, rgb=True, depth=depth) if is_rendered else {}
                 frame[f"{name}_rgb"] = images.get("rgb")
                 if depth:
-                    frame[f"{name}_depth"] = images["depth"].astype(np.int16) if seen else None
+                    frame[f"{name}_depth"] = images["depth"].astype(np.int16) if is_rendered else None
             if getattr(self.include, f"{name}_camera_extrinsic"):
                 frame[f"{name}_camera_extrinsic"] = self.extrinsic(name)
         return frame
 
     def segmentation(self) -> np.ndarray:
-        """Object ids [256, 256] of the present front picture, which is taken if the frame has none."""
+        """Object ids [256, 256] of the present front image, which is taken if the frame has none."""
         if "front" not in self._taken:
-            self._take_pictures(["front"])
-        return self._read(SENSORS["front"], segmentation=True)["segmentation"][..., 0]
+            self._render_cameras(["front"])
+        return read_images(self.task, "front", segmentation=True)["segmentation"][..., 0]
 
     def extrinsic(self, name: str) -> np.ndarray:
         """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
-        return front_extrinsic() if name == "front" else extrinsic_of(self._wrist_pose())
+        if name == "front":
+            return front_extrinsic()
+        return extrinsic_of(self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose)
 
-    def _wrist_pose(self) -> "sapien.Pose":
-        return self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
-
-    def _take_pictures(self, cameras: Collection[str]) -> None:
+    def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
-        if not cameras:
-            return
-        scene = self.task.scene
-        scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        for name in cameras:
-            scene.sensors[SENSORS[name]].capture()
+        capture(self.task, cameras)
         self._taken |= set(cameras)
 
-    def _read(
-        self, camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
-    ) -> dict[str, np.ndarray]:
-        sensor = self.task.scene.sensors[camera]
-        images = sensor.get_obs(rgb=rgb, depth=depth, position=False, segmentation=segmentation)
-        return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
+
+def capture(task: "Task", cameras: Collection[str]) -> None:
+    """Render the scene by these cameras of `SENSORS`."""
+    if cameras:
+        task.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+    for name in cameras:
+        task.scene.sensors[SENSORS[name]].capture()
+
+
+def read_images(
+    task: "Task", camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
+) -> dict[str, np.ndarray]:
+    """What a camera last captured: `rgb`, `depth` and `segmentation`, each [256, 256, channels]."""
+    sensor = task.scene.sensors[SENSORS[camera]]
+    images = sensor.get_obs(rgb=rgb, depth=depth, position=False, segmentation=segmentation)
+    return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
 
 
 def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:
@@ -227,8 +252,10 @@ def frame_keys(include: Include, render: bool) -> list[str]:
     return [*keys, *(["maniskill_obs"] if include.maniskill_obs else [])]
 
 
-def observation_space(keys: Sequence[str]) -> gymnasium.spaces.Dict:
+def observation_space(keys: Sequence[str]) -> "gymnasium.spaces.Dict":
     """Lists of frames, as Gymnasium describes them; the raw simulator observation is left out."""
+    import gymnasium
+
     image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
     depth = gymnasium.spaces.Box(-(2**15), 2**15 - 1, (SIDE, SIDE, 1), np.int16)
     boxes: dict[str, gymnasium.Space] = {

@@ -1,51 +1,103 @@
-"""The renderer, kept for the life of the process.
+"""The renderer: the device it runs on, its shaders, and the engine that is kept for the life of the process."""
 
-ManiSkill makes a render system for each scene. All of them share SAPIEN's engine, in which shaders and pipelines are
-compiled when the first picture is taken, half a second where software renders; it goes with the last render system
-that holds it. An episode that closes its scene before the next one opens so pays for it again. One more render system,
-never released, keeps it; scenes stay separate, and pictures the same.
-
-It also keeps one Vulkan device from being opened per environment, of which NVIDIA's driver bears some thirty only.
-"""
-
+import hashlib
 import logging
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mme_vla.envs.shaders import lean_shaders
+from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     import sapien
+    from mani_skill.render import ShaderConfig
+
+INSTALL_HINT = (
+    "Rendering needs a Vulkan driver: an NVIDIA GPU's own, or, without one, Mesa's software driver, 24 or newer. "
+    "On Debian and Ubuntu run scripts/install_vulkan.sh (it installs libvulkan1 and mesa-vulkan-drivers >= 24; on "
+    "Debian 12 from bookworm-backports). Or pass render=False for an environment without images."
+)
+OLDEST_MESA = 24
+
+
+@cache
+def render_backend() -> str:
+    """The simulator's name for the device that renders: the GPU if there is one, else the CPU."""
+    import sapien
+
+    try:
+        summary = str(sapien.render.get_device_summary())
+    except RuntimeError as error:
+        raise UserError(f"This machine cannot render ({error}). {INSTALL_HINT}") from None
+    supported = [name for name, yes in devices(summary) if yes]
+    if not supported:
+        raise UserError(f"No Vulkan driver here is new enough:\n{summary.strip()}\n{INSTALL_HINT}")
+    try:
+        if sapien.Device("cuda").can_render():
+            return "sapien_cuda"
+    except RuntimeError:
+        logging.getLogger(__name__).debug("no CUDA device to render on")
+    if all("llvmpipe" in name for name in supported):
+        version = mesa_version()
+        if version is not None and version < OLDEST_MESA:
+            raise UserError(f"mesa-vulkan-drivers {version} is too old to render with. {INSTALL_HINT}")
+    return "sapien_cpu"
+
+
+def devices(summary: str) -> list[tuple[str, bool]]:
+    """Name of each device in SAPIEN's summary, and whether SAPIEN supports it."""
+    matches = re.findall(r"GPU:\s*(.+?)\s*\n\s*Supported:\s*(\d)", summary)
+    return [(name, flag == "1") for name, flag in matches]
+
+
+def mesa_version() -> int | None:
+    """Major version of the installed package mesa-vulkan-drivers; None where the system is not Debian's kind."""
+    if shutil.which("dpkg-query") is None:
+        return None
+    command = ["dpkg-query", "-W", "-f=${Version}", "mesa-vulkan-drivers"]
+    output = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    major = re.match(r"(?:\d+:)?(\d+)\.", output)
+    return int(major.group(1)) if major else None
+
 
 _CHECK_SIZE = 8
 
-_kept: dict[str, "sapien.render.RenderSystem"] = {}
+_systems: dict[str, "sapien.render.RenderSystem"] = {}
 
 
 def keep_renderer(device: "sapien.Device") -> None:
-    """Hold the engine that renders on a device until the process ends; asking again does nothing."""
+    """Keep the engine that renders on a device until the process ends; further calls have no effect.
+
+    ManiSkill makes a render system for each scene, and all of them share SAPIEN's engine. Its shaders and pipelines are
+    compiled for the first image, which takes half a second on a CPU, and are freed with the last render system. An
+    additional render system keeps them, and a single Vulkan device, of which NVIDIA's driver supports some thirty.
+    """
     import sapien
 
     name = str(device.name)
-    if name not in _kept:
-        _kept[name] = sapien.render.RenderSystem(device)
+    if name not in _systems:
+        _systems[name] = sapien.render.RenderSystem(device)
 
 
 def renderer_works() -> bool:
-    """Whether each renderer that is kept still takes pictures; true where none is kept.
+    """Whether each kept renderer still renders; true where none is kept.
 
-    A lost device or memory that ran out leaves a renderer behind that fails from then on, whatever is asked of it: only
-    another process helps.
+    After a lost device or exhausted memory a renderer fails until the process ends.
     """
     try:
-        for system in _kept.values():
-            _take_picture(system.device)
+        for system in _systems.values():
+            _render_once(system.device)
     except RuntimeError as error:  # all that Vulkan's errors become
         logging.getLogger(__name__).warning("the renderer has failed: %s", error)
         return False
     return True
 
 
-def _take_picture(device: "sapien.Device") -> None:
+def _render_once(device: "sapien.Device") -> None:
     import sapien
 
     lean = lean_shaders() if device.is_cpu() else None
@@ -55,3 +107,57 @@ def _take_picture(device: "sapien.Device") -> None:
     scene.update_render()
     camera.take_picture()
     camera.get_picture("Color")
+
+
+PACK = "minimal"
+"""ManiSkill's shaders of cameras that observe."""
+_TABLE = "samplerBRDFLUT"
+_DECLARED = re.compile(rf"^layout\(.*\) uniform sampler2D {_TABLE};$", re.MULTILINE)
+_READ = re.compile(rf"texture\({_TABLE}, vec2\([^()]*\)\)\.xy")
+
+
+def without_table(source: str) -> str:
+    """The text of a shader without the table; values read from it become zero."""
+    return _DECLARED.sub("", _READ.sub("vec2(0)", source))
+
+
+def lean_shaders() -> "ShaderConfig | None":
+    """Shaders for cameras in scenes without an environment map; None where the installed ones are not as expected.
+
+    Sets the formats of images, which ManiSkill sets by the pack's name, so call this right before the cameras are made.
+    """
+    from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
+
+    folder = _pipeline_folder()
+    if folder is None:
+        return None
+    stock = PREBUILT_SHADER_CONFIGS[PACK]
+    set_shader_pack(stock)
+    return replace(stock, shader_pack=str(folder))
+
+
+@cache
+def _pipeline_folder() -> Path | None:
+    """The folder of changed shaders, made once for an installed SAPIEN."""
+    import sapien
+
+    from mme_vla.utils import user_cache, write_atomically
+
+    stock = Path(sapien.__file__).parent / "vulkan_shader"
+    shaders = {
+        file.relative_to(stock): file.read_text(encoding="utf-8")
+        for part in (PACK, "common")
+        for file in sorted((stock / part).glob("*"))
+        if file.is_file()
+    }
+    lean = {name: without_table(text) for name, text in shaders.items()}
+    if lean == shaders or any(_TABLE in text for text in lean.values()):
+        logging.getLogger(__name__).debug("unknown shaders are used unchanged: %s", stock)
+        return None
+    key = hashlib.sha256(repr(sorted(lean.items())).encode()).hexdigest()[:16]
+    caches = user_cache("shaders") / key
+    for name, text in lean.items():
+        if not (caches / name).is_file():
+            with write_atomically(caches / name) as draft:
+                draft.write_text(text, encoding="utf-8")
+    return caches / PACK

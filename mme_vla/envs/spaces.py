@@ -22,7 +22,6 @@ import sapien
 from scipy.spatial.transform import Rotation
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
-from mme_vla.envs.choices import nearest_to_pixel
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robot.control import GRIPPER_STEPS
 from mme_vla.errors import UserError, did_you_mean
@@ -51,9 +50,12 @@ class ActionSpace:
 
     name: ClassVar[str]
 
+    width: ClassVar[int] = len(POSE)
+    """Numbers of an action besides the gripper's."""
+
     def space(self, stick: bool) -> gymnasium.Space:
         """The Gymnasium space of actions."""
-        raise NotImplementedError
+        return gymnasium.spaces.Box(-np.inf, np.inf, (self.width + (not stick),), np.float32)
 
     def act(self, control: Control, action: Any) -> None:
         """Do the control steps of one action.
@@ -70,13 +72,11 @@ class JointAngle(ActionSpace):
     """Absolute joint targets; the stick takes the first seven of at least seven numbers."""
 
     name = "joint_angle"
-
-    def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(ARM_JOINTS + (not stick))
+    width = ARM_JOINTS
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
-        width = ARM_JOINTS + (not stick)
+        width = self.width + (not stick)
         numbers = _numbers(action, width, "seven joint angles and the gripper", longer=stick)
         control.step(numbers[:width])
 
@@ -85,9 +85,6 @@ class EndEffectorPose(ActionSpace):
     """An absolute pose of the tool, reached in one control step from inverse kinematics at the present joints."""
 
     name = "ee_pose"
-
-    def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(len(POSE) + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
@@ -102,9 +99,6 @@ class Waypoint(ActionSpace):
     """An absolute pose of the tool, reached by a planned motion; then the gripper closes at -1 or opens at +1."""
 
     name = "waypoint"
-
-    def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(len(POSE) + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
@@ -121,7 +115,7 @@ class Waypoint(ActionSpace):
 
 
 class MultiChoice(ActionSpace):
-    """One of the task's options by its letter, with a pixel [y, x] of the front picture where it needs an object."""
+    """One of the task's options by its letter, with a pixel [y, x] of the front image where it needs an object."""
 
     name = "multi_choice"
 
@@ -135,7 +129,7 @@ class MultiChoice(ActionSpace):
         label = action["choice"].strip().lower()
         choices = {choice.label: choice for choice in control.task.choices()}
         if label not in choices:
-            # The benchmark answers an unknown letter with no step at all; say so instead of leaving it a riddle.
+            # As in the benchmark, an unknown letter makes no step.
             warnings.warn(f"Unknown choice {action['choice']!r}: no step. {did_you_mean(label, choices)}", stacklevel=2)
             return
         choice = choices[label]
@@ -145,8 +139,9 @@ class MultiChoice(ActionSpace):
         point = action.get("point")
         if point is None or len(point) == 0:
             raise UserError(f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object meant.")
-        pixel = _numbers(point, 2, "a pixel's row and column").tolist()
-        choice.run(control.demonstrator, nearest_to_pixel(pixel, choice.candidates(), project))
+        pixel = _numbers(point, 2, "a pixel's row and column")
+        nearest = min(choice.candidates(), key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)))
+        choice.run(control.demonstrator, nearest)
 
 
 SPACES: dict[str, ActionSpace] = {
@@ -155,18 +150,10 @@ SPACES: dict[str, ActionSpace] = {
 
 
 def action_space(name: str) -> ActionSpace:
-    """The action space of that name.
-
-    Raises:
-        UserError: no such action space.
-    """
+    """The action space of that name."""
     if name not in SPACES:
         raise UserError(f"Unknown action space {name!r}. {did_you_mean(str(name), SPACES)}")
     return SPACES[name]
-
-
-def _unbounded(size: int) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
 def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.ndarray:

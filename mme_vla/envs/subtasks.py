@@ -1,23 +1,44 @@
-"""The ordered list of sub-tasks an episode consists of, and the pointer that walks over it."""
+"""The sub-tasks of an episode, the pointer that walks over them, the options of multi-choice, and the scores."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from mme_vla.errors import UserError, brief
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
     from mme_vla.envs.scene.things import Thing
 
+
+ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+def ordinal(index: int) -> str:
+    """Return `first` for 0, `second` for 1, and so on; figures from `11th` on."""
+    if index < len(ORDINALS):
+        return ORDINALS[index]
+    count = index + 1
+    teens = 10 < count % 100 < 14
+    return f"{count}{'th' if teens else {1: 'st', 2: 'nd', 3: 'rd'}.get(count % 10, 'th')}"
+
+
+def number(count: int) -> str:
+    """Return `one` for 1, `two` for 2, and so on; figures from 11 on."""
+    return NUMBERS[count] if count < len(NUMBERS) else str(count)
+
+
 NO_RECORD = "NO RECORD"
 """Text of the stretches that belong to no sub-task: their frames are neither stored nor shown."""
 COMPLETED = "All tasks completed"
 OPERATIONS = ("which", "where", "how many", "order", "how")
-"""What a sub-task can ask of memory."""
+"""What a sub-task can require of memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class SubTask:
-    """One step of an episode: what is said, when it is done, when it has failed, and how it is demonstrated."""
+    """One step of an episode: its text, when it is done, when it has failed, and how it is demonstrated."""
 
     text: str
     """Without coordinates."""
@@ -28,7 +49,7 @@ class SubTask:
     """With a `<>` for each target's pixel; empty: the same as `text`."""
     failed: Callable[[], bool] | None = None
     targets: Sequence["Thing"] = ()
-    """The objects whose pixels fill the `<>`, in order; several may stand for one place if there is one `<>`."""
+    """The objects whose pixels fill the `<>`, in order; a single `<>` takes all of them together."""
     choice: str = ""
     """Letter of the multi-choice option that does this; empty where there is none."""
     video: bool = False
@@ -36,12 +57,29 @@ class SubTask:
     pick: bool = False
     """A grasp from the table: what a recovery demonstration may fail once."""
     operation: str | Callable[[], str] = ""
-    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. Asked at the moment of the failure."""
+    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. A function is called at the failure."""
 
     @property
     def grounded_text(self) -> str:
         """The text with places for coordinates."""
         return self.grounded or self.text
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One option of the multi-choice action space: its letter (lower case), its text, and its motion."""
+
+    label: str
+    action: str
+    run: Callable[["Demonstrator", Any], None]
+    """Gets the object the point chose, or None where the option needs no point."""
+    candidates: Callable[[], Sequence["Thing"]] | None = None
+    """Objects a point may choose among; an option with candidates needs a point."""
+
+    @property
+    def needs_point(self) -> bool:
+        """Whether a pixel of the front image must come with the choice."""
+        return self.candidates is not None
 
 
 class Progress:
@@ -85,7 +123,7 @@ class Progress:
         return self.subtasks[self.index :]
 
     @property
-    def shown(self) -> SubTask:
+    def displayed(self) -> SubTask:
         """The sub-task whose text is reported online: the current one, and at the end the last one."""
         return self.subtasks[min(self.index, len(self.subtasks) - 1)]
 
@@ -98,3 +136,71 @@ class Progress:
     def succeeded(self) -> bool:
         """Whether every sub-task is done."""
         return self.index >= len(self.subtasks)
+
+
+def _subtask_share(progress: Progress, success: bool) -> float:
+    """The share of the execution's sub-tasks that are done; those of the conditioning video do not count."""
+    execution = [i for i, subtask in enumerate(progress.subtasks) if not subtask.video]
+    return sum(i < progress.index for i in execution) / len(execution)
+
+
+REWARDS: dict[str, Callable[[Progress, bool], float]] = {
+    "none": lambda progress, success: 0.0,
+    "sparse": lambda progress, success: float(success),
+    "subtask": _subtask_share,
+}
+"""Return so far, 0 to 1, from the progress and the success of the episode, by the name of the reward."""
+
+MOTION = "motion"
+BROKEN = ("wrong", "stuck")
+
+
+@dataclass(frozen=True)
+class ProcessScore:
+    """How far an episode came.
+
+    done, of: sub-tasks of the execution that are done, and how many there are.
+    broke: `wrong`, where the environment saw the wrong thing done; `stuck`, where the time ran out; empty on success.
+    operation: what the wrong thing was a mistake of: one of `OPERATIONS`, or a motion (a slip, or another object than
+        the goal names). Empty for `stuck`, whose cause is unknown.
+    subtask: the text of the one that was not done.
+    """
+
+    done: int
+    of: int
+    broke: str = ""
+    operation: str = ""
+    subtask: str = ""
+
+    @property
+    def forgot(self) -> bool:
+        """Whether an operation of memory broke the chain."""
+        return self.operation in OPERATIONS
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for records."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, value: Any) -> "ProcessScore":
+        """Read what `to_dict` made."""
+        try:
+            score = cls(**value)
+        except TypeError:
+            score = None
+        known = (MOTION, "", *OPERATIONS)
+        if score is None or score.operation not in known or score.broke not in (*BROKEN, ""):
+            raise UserError(f"process={brief(value)} of a record is no process score.")
+        return score
+
+
+def process_score(progress: Progress, status: str) -> ProcessScore:
+    """The score of an episode that ended with this status."""
+    execution = [subtask for subtask in progress.subtasks if not subtask.video]
+    done = max(progress.index - (len(progress.subtasks) - len(execution)), 0)
+    if status == "success":
+        return ProcessScore(len(execution), len(execution))
+    text = progress.displayed.text
+    if status == "fail":
+        return ProcessScore(done, len(execution), "wrong", progress.mistaken or MOTION, text)
+    return ProcessScore(done, len(execution), "stuck", "", text)

@@ -9,11 +9,10 @@ from typing import Any, ClassVar
 
 import torch
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, build_cue, show_cue
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Cue, build_cue, show_cue
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.stage import Stage
-from mme_vla.envs.subtasks import Progress, SubTask
+from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import UserError, did_you_mean
 
 DIFFICULTIES = ("easy", "medium", "hard")
@@ -26,25 +25,25 @@ class Task(Stage):
     Args:
         seed: fixes the scene and the script; the `seed` of `reset` has no effect.
         difficulty: `easy`, `medium` or `hard`; by default seed % 3 decides.
-        recovery: `z` or `xy` draws the pick that a recovery demonstration fails once, and how.
-        stress: how far dials are turned (`variants.DIALS`); at 0 the scene is the benchmark's.
+        recovery: `z` or `xy` samples the pick that a recovery demonstration fails once.
+        stress: how far dials are turned (`metadata.DIALS`); at 0 the scene is the benchmark's.
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
-        second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
-        robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's own words for `recovery`.
+        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
+        does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for `recovery`.
 
     Raises:
         UserError: an unknown difficulty or recovery mode, a negative seed, or a dial that the task does not have.
     """
 
     shared_draws: ClassVar[bool] = False
-    """`plan`, `build` and `start_episode` draw from one generator; otherwise `plan` has one of its own."""
+    """`plan`, `build` and `start_episode` sample from one generator; otherwise `plan` has one of its own."""
     latch_failure: ClassVar[bool] = False
-    """A failure lasts; otherwise it is judged anew at each step."""
-    recovery_drawn_per_episode: ClassVar[bool] = False
-    """The failed pick is drawn in every initialisation (there are two), not once after the scene."""
+    """A failure lasts; otherwise it is evaluated anew at each step."""
+    recovery_sampled_per_episode: ClassVar[bool] = False
+    """The failed pick is sampled in every initialisation (there are two), not once after the scene."""
 
     dials: ClassVar[frozenset[str]] = frozenset()
-    """Dials of `variants.DIALS` that the task heeds."""
+    """Dials of `metadata.DIALS` that the task has."""
 
     def __init__(
         self,
@@ -77,11 +76,9 @@ class Task(Stage):
         """Dials that are turned, and how far."""
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
-        self.recording = False
-        """A demonstrator is recording: `dropped` is judged as it was when the official data were recorded."""
-        self.observe: Callable[[dict[str, Any]], None] | None = None
-        """Called in every step when the moment has come to observe: after the evaluation, whose info it gets, and
-        before `after_step`."""
+        self.on_frame: Callable[[dict[str, Any]], None] | None = None
+        """Called once a step with the info of the evaluation, after the physics and before `after_step`. While it is
+        set, the simulator makes no observation of its own."""
         self.failed_pick: int | None = None
         """Index, among the picks of the execution, of the one that a recovery demonstration fails first."""
         super().__init__(*args, seed=seed, **kwargs)
@@ -93,14 +90,14 @@ class Task(Stage):
     # What a task supplies -----------------------------------------------------------------------------------------
 
     def plan(self, draws: Draws) -> None:
-        """Draw what is decided before there is a scene."""
+        """Sample what is decided before there is a scene."""
 
     def build(self, draws: Draws) -> None:
-        """Draw the layout and put the objects on the table; each goes through `self.add`."""
+        """Sample the layout and put the objects on the table; each goes through `self.add`."""
         raise NotImplementedError
 
     def start_episode(self, draws: Draws) -> None:
-        """Draw what is decided per episode and set the script's state; objects are already in their places."""
+        """Sample what is decided per episode and set the script's state; objects are already in their places."""
 
     def subtasks(self) -> list[SubTask]:
         """The sub-tasks in order."""
@@ -121,10 +118,7 @@ class Task(Stage):
         """Scripted changes after a step's physics, evaluation and observation; `k` steps have been done."""
 
     def cues(self) -> Sequence[Cue]:
-        """With `in_view`: the discs that show what is to be remembered, asked for once the scene is built.
-
-        Where they lie is asked for at each step, and when an episode begins.
-        """
+        """With `in_view`: the discs that show what is to be remembered; built with the scene, moved at each step."""
         return ()
 
     def failure(self) -> bool:
@@ -144,20 +138,20 @@ class Task(Stage):
         if not self.shared_draws:
             draws = Draws(self.seed)
         self.build(draws)
-        self.draws, self._drawn = draws, draws.state()
+        self.draws, self._draws_state = draws, draws.state()
         cues = self.cues() if self.in_view else ()
         self._cues = [(build_cue(self, f"cue_{i}", cue), cue) for i, cue in enumerate(cues)]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.tidy(env_idx)
-        self.draws.restore(self._drawn)
-        # The official construction initialises an episode twice, and what the second one draws counts.
+        self.draws.restore(self._draws_state)
+        # The official construction initialises an episode twice, and the samples of the second one count.
         for attempt in range(2):
             for thing in self.things:
                 thing.restore()
             self.start_episode(self.draws)
             subtasks = self.subtasks()
-            if self.recovery and (attempt == 0 or self.recovery_drawn_per_episode):
+            if self.recovery and (attempt == 0 or self.recovery_sampled_per_episode):
                 self.failed_pick = self.draw_failed_pick(self.draws, sum(s.pick and not s.video for s in subtasks))
         self.progress = Progress(subtasks, self.latch_failure)
         self._show_cues()
@@ -174,9 +168,14 @@ class Task(Stage):
         return result
 
     def get_obs(self, info: dict | None = None, unflattened: bool = False) -> Any:
-        if self.observe is not None and info is not None:
-            self.observe(info)
-        return super().get_obs(info, unflattened)
+        if self.on_frame is None or info is None:
+            return super().get_obs(info, unflattened)
+        self.on_frame(info)
+        return {}
+
+    def simulator_obs(self, info: dict[str, Any]) -> Any:
+        """The present observation in ManiSkill's own format."""
+        return super().get_obs(info)
 
     def _before_control_step(self) -> None:
         self.before_physics(self.steps_done)

@@ -1,6 +1,5 @@
 """What is kept of an evaluated episode, and how records come together into runs."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -8,7 +7,7 @@ from types import NoneType
 from typing import Any, NamedTuple, Self
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.files import parse_json, sealed, unsealed
+from mme_vla.utils import parse_json, to_line, verified
 
 _LARGEST = 2**63  # numbers from there on are damage
 OUTCOMES = ("success", "fail", "timeout", "error")
@@ -42,7 +41,7 @@ class EpisodeKey(NamedTuple):
 class Seconds:
     """Where an episode's wall time went.
 
-    sim: building and stepping the environment, without its pictures. render: those (0 where they cannot be told apart).
+    sim: building and stepping the environment, without its images. render: those (0 where they cannot be separated).
     policy: the episode's share of the policy's batches. total: from its beginning to its end, waiting included.
     """
 
@@ -68,7 +67,7 @@ class EpisodeRecord:
     steps: control steps executed, one an action but for planned motions. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
-    composition: `composition_digest` (policy/digest.py) of the policy, so that no two configurations are averaged
+    composition: `composition_digest` (policy/saving.py) of the policy, so that no two configurations are averaged
         under one name; None in records written before there was one, and of players that are no policy of this library.
     extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.
@@ -100,8 +99,8 @@ class EpisodeRecord:
         for name, kind in _KINDS.items():
             value = getattr(self, name)
             if not isinstance(value, kind) or isinstance(value, bool):
-                wanted = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-                raise UserError(f"{name}={brief(value)} of a record must be {wanted}, not {type(value).__name__}.")
+                expected = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
+                raise UserError(f"{name}={brief(value)} of a record must be {expected}, not {type(value).__name__}.")
             if isinstance(value, int) and abs(value) >= _LARGEST:
                 raise UserError(f"{name}={brief(value)} of a record is out of range.")
         if self.composition is not None and not isinstance(self.composition, str):
@@ -124,17 +123,17 @@ class EpisodeRecord:
 
     def to_json(self) -> str:
         """One line, without its end; a checksum in it tells damage."""
-        return json.dumps(sealed(asdict(self)), ensure_ascii=False, separators=(",", ":"))
+        return to_line(asdict(self))
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:
-        """Read a line.
-
-        Raises:
-            UserError: it is not JSON, not a record (fields are missing, unknown or wrong), or not what was written.
-        """
+        """Read a line."""
         # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
-        values = unsealed(parse_json(line, "an episode record", finite=False), "an episode record")
+        return cls.from_dict(verified(parse_json(line, "an episode record", finite=False), "an episode record"))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Read the object of a line, without its checksum."""
         known = {member.name for member in fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
@@ -169,18 +168,15 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
 
     Args:
         records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
-
-    Raises:
-        UserError: conflicting outcomes, or two runs of an episode that are not of the same environment.
     """
     if conflicts not in ("refuse", "first", "last"):
         raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
-    kept: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
+    merged: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
     for new in records:
         at = (new.run, new.key)
-        old = kept.get(at)
+        old = merged.get(at)
         if old is None or (old.outcome == "error" and new.outcome != "error"):
-            kept[at] = new
+            merged[at] = new
             continue
         if new.seed != old.seed:
             raise UserError(
@@ -195,8 +191,8 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
                 f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last."
             )
         if (conflicts == "last") == (new.when > old.when):
-            kept[at] = new
-    return list(kept.values())
+            merged[at] = new
+    return list(merged.values())
 
 
 def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
@@ -209,7 +205,7 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     for record in records:
         if record.composition is not None:
             digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
-    only = {run: next(iter(found)) for run, found in digests.items() if len(found) == 1}
+    only = {run: next(iter(run_digests)) for run, run_digests in digests.items() if len(run_digests) == 1}
     return [
         replace(record, composition=only[record.run]) if record.composition is None and record.run in only else record
         for record in records
@@ -217,11 +213,7 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
 
 
 def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:
-    """Group merged records.
-
-    Raises:
-        UserError: one run mixes step limits or action spaces, so its episodes cannot be averaged.
-    """
+    """Group merged records."""
     runs: dict[RunKey, list[EpisodeRecord]] = {}
     for record in records:
         runs.setdefault(record.run, []).append(record)
@@ -234,7 +226,7 @@ def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]
 
 
 def finished(records: Iterable[EpisodeRecord], retry_errors: bool = True) -> set[EpisodeKey]:
-    """The episodes of one run that need not be run again; those that ended in an error do, unless told otherwise."""
+    """The episodes of one run that need not be run again; those that ended in an error do by default."""
     return {record.key for record in records if not (retry_errors and record.outcome == "error")}
 
 

@@ -5,9 +5,9 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
+from mme_vla.backbone.attention import PI05_VISIBILITY, Block, Visibility
 from mme_vla.backbone.base import Hook, Injection
-from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Block, Visibility
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.types import MemoryTokens
 
@@ -29,11 +29,7 @@ POSITIONS = ("slot", "time")
 
 
 def checked_position(memory_position: str) -> str:
-    """The value of `integration.memory_position`.
-
-    Raises:
-        UserError: it is neither `slot` nor `time`.
-    """
+    """The value of `integration.memory_position`."""
     if memory_position not in POSITIONS:
         known = did_you_mean(str(memory_position), POSITIONS)
         raise UserError(f"integration.memory_position={brief(memory_position)}: choose slot or time. {known}")
@@ -58,7 +54,7 @@ class Integration(nn.Module):
 
     memory_width: int = 0
     visibility: Visibility = PI05_VISIBILITY
-    brings: ClassVar[frozenset[str]] = frozenset()
+    required_features: ClassVar[frozenset[str]] = frozenset()
     memory_position: str = "slot"
 
     def __init__(self, backbone: BackboneConfig) -> None:
@@ -87,7 +83,7 @@ class Integration(nn.Module):
         )  # fmt: skip
 
 
-def own_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
+def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
     """Where a memory block stands whose tokens are placed in time, [b, budget] float32; None numbers it by slots.
 
     The current frame is the last place before the blocks that follow, and every frame before it is a place further
@@ -105,14 +101,16 @@ def ages_of(memory: MemoryTokens) -> Tensor:
     return memory.ages
 
 
-DOORS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
+EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
 """Methods of an integration that go through one of a backbone's doors (`Backbone.hosts`)."""
 
 
-def doors_of(kind: type[Integration]) -> frozenset[str]:
+def extension_points(kind: type[Integration]) -> frozenset[str]:
     """The doors an integration goes through: those it overrides. Asked before it is built to a backbone's sizes."""
-    overridden = {door for name, door in DOORS.items() if getattr(kind, name) is not getattr(Integration, name)}
-    return kind.brings | overridden
+    overridden = {
+        point for name, point in EXTENSION_POINTS.items() if getattr(kind, name) is not getattr(Integration, name)
+    }
+    return kind.required_features | overridden
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:

@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.layers.blocks import Block, Visibility
-from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.backbone.attention import Block, Visibility
+from mme_vla.backbone.config import BackboneConfig
 from mme_vla.errors import UserError
 from mme_vla.integration.base import (
     MEMORY_VISIBILITY,
     Integration,
     checked_position,
+    explicit_positions,
     memory_visibility,
-    own_positions,
     required,
 )
 from mme_vla.registry import INTEGRATIONS
@@ -42,9 +42,6 @@ class Context(Integration):
                 positions before the images as their frames lie in the past.
             mutual: memory stands between images and prompt, and all three see each other, as LeRobot's tokens of past
                 states do.
-
-        Raises:
-            UserError: a choice that there is not, or that this backbone does not have.
         """
         super().__init__(backbone)
         if not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False):
@@ -63,7 +60,7 @@ class Context(Integration):
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         memory = required(memory)
-        positions = own_positions(memory, self.memory_position)
+        positions = explicit_positions(memory, self.memory_position)
         block = Block("memory", memory.tokens, memory.mask, "vlm", positions)
-        before = 1 + [seen.name for seen in observation].index("images") if self.mutual else 0
+        before = 1 + [block.name for block in observation].index("images") if self.mutual else 0
         return [*observation[:before], block, *observation[before:]]

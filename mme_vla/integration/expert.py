@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.layers.blocks import Block
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
-from mme_vla.integration.base import Integration, checked_position, memory_visibility, own_positions, required
+from mme_vla.backbone.attention import Block
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.integration.base import Integration, checked_position, explicit_positions, memory_visibility, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
 
@@ -36,5 +36,5 @@ class MemoryExpert(Integration):
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         memory = required(memory)
-        positions = own_positions(memory, self.memory_position)
+        positions = explicit_positions(memory, self.memory_position)
         return [Block("memory", memory.tokens, memory.mask, "memory", positions), *observation]

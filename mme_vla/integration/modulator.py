@@ -5,12 +5,10 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.attention import additive_mask, attend
 from mme_vla.backbone.base import Hook, LayerHooks
-from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.norms import EPS, RMSNorm, rms_normalise
-from mme_vla.backbone.layers.precision import compute_dtype
-from mme_vla.backbone.layers.rope import rotate, rotation
-from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.layers import EPS, RMSNorm, compute_dtype, rms_normalise, rotate, rotation
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
@@ -41,14 +39,14 @@ class ModulatorLayer(nn.Module):
         k, v = kv.chunk(2, dim=-2)
         return rotate(k, rotation(_positions(0, memory) if positions is None else positions, self.head_dim)), v
 
-    def recall(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+    def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding included."""
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
         return self.out(attend(rotate(q, rotation(_positions(k.shape[1], x), self.head_dim)), k, v, mask))
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """x̂ = rms(x)·(1 + a) + β with (a, β) = W r + b."""
-        a, beta = self.modulation(self.recall(x, k, v, mask)).float().chunk(2, dim=-1)
+        a, beta = self.modulation(self.read_memory(x, k, v, mask)).float().chunk(2, dim=-1)
         if self.exact_identity:
             # The same direction at x's own size: the norm that follows removes it, and a = β = 0 gives x to the bit.
             size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()
@@ -76,9 +74,6 @@ class Modulator(Integration):
             exact_identity: start as the memoryless policy to the bit; as released (False) it starts near it.
             memory_position: `slot` numbers memory tokens one after the other, as released; `time` places a token as
                 many positions before the first action as its frame lies in the past, and one.
-
-        Raises:
-            UserError: a choice of `memory_position` that there is not.
         """
         super().__init__(backbone)
         self.memory_width, self.memory_position = backbone.action.width, checked_position(memory_position)

@@ -1,4 +1,4 @@
-"""`Memory`: choose stored tokens, then encode them into at most `budget` memory tokens."""
+"""`MemoryModule`: choose stored tokens, then encode them into at most `budget` memory tokens."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,16 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.history import FrameScorer, History, OnlineHistory, StorageSpec
-from mme_vla.memory.lazy import LazyHistory
+from mme_vla.memory.history import FrameScorer, History, LazyHistory, OnlineHistory, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
 
-LINES = 16
-"""Rows and columns of token positions count in so many parts of a view's side, as released, whatever its token grid."""
+POSITION_GRID = 16
+"""Rows and columns of token positions are in sixteenths of a view's side, as released, whatever its token grid."""
 
 
 @dataclass(frozen=True)
-class LooksBack:
+class PastViewSpec:
     """Past views that a memory gives the backbone along with the current ones, of every camera.
 
     frames: how many, the current one among them. stride: frames between two of them.
@@ -34,33 +33,27 @@ class LooksBack:
         return step - self.stride * np.arange(self.frames - 1, 0, -1)
 
     @property
-    def reach(self) -> int:
+    def span(self) -> int:
         """How many frames before the current one the oldest lies."""
         return (self.frames - 1) * self.stride
 
 
-class Memory(nn.Module):
-    """The interface of every neural memory.
+class MemoryModule(nn.Module):
+    """The interface of every neural memory: choose stored tokens, then encode them.
 
-    A subclass sets, before use:
-        budget: most memory tokens it may hand over; 0 for a memory that speaks through past views alone.
+    A subclass implements `select` and `forward`, and sets:
+        budget: most memory tokens it returns; 0 for a memory of past views alone.
         capacity: most stored tokens it may select (`budget` unless the encoder reads more than it writes); selections
             are padded to it unless `padded_length` says otherwise.
-        storage: what has to be stored of each frame.
-        lazy: True encodes a frame of an episode when it is first read, for memories that read few of those they keep.
-        pad_left: True puts the padding before the tokens (recurrent memories), False after them.
-        timed: whether each memory token speaks of one moment, which `MemoryTokens.ages` tells: what
-            `integration.memory_position=time` reads.
-        reads_motion: whether it reads what the robot felt and did (`History.moved`) instead of stored tokens.
-        looks_back: past views that it gives the backbone along with the current ones; None gives none.
+        storage: what is stored of each frame.
+        lazy: encode a frame of an episode when it is first read, for memories that read few of their stored frames.
+        pad_left: padding comes before the tokens (recurrent memories) instead of after them.
+        timed: each memory token belongs to one frame, whose age is in `MemoryTokens.ages`; required by
+            `integration.memory_position=time`.
+        reporting: set from outside for updates that are logged; `forward` then fills `MemoryTokens.metrics`.
 
-    `reporting` is set from outside: True asks `forward` for numbers about its inside, as `MemoryTokens.metrics`. The
-    training loop sets it for the updates it logs; where it is False, what only these numbers need is not computed.
-
-    `float32_products`, set from outside too, says how a GPU multiplies what a memory computes in float32: `ieee` or
-    `tf32`.
-
-    and implements `select` and `forward`.
+    Optional capabilities are classes to inherit from as well: `StreamingMemory`, `ScoringMemory`, `ProprioMemory`,
+    `PastViewMemory`, `CompilableMemory`, `MatmulPrecision`.
     """
 
     budget: int
@@ -68,58 +61,46 @@ class Memory(nn.Module):
     storage: StorageSpec
     pad_left: bool = False
     timed: bool = False
-    reads_motion: bool = False
-    looks_back: LooksBack | None = None
     lazy: bool = False
     reporting: bool = False
-    float32_products: str = "ieee"
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Takes no arguments: a subclass calls `super().__init__()` and then sets the attributes above.
-
-        Raises:
-            TypeError: there are arguments.
-        """
+        """Takes no arguments: a subclass calls `super().__init__()` and then sets the attributes above."""
         if args or kwargs:
             raise TypeError(
-                f"{type(self).__name__}: Memory.__init__() takes no arguments, got {len(args) + len(kwargs)}. Call "
-                "super().__init__(), then set self.budget, self.capacity and self.storage. Only PerceptualMemory takes "
-                "(d_vision, width, budget, storage)."
+                f"{type(self).__name__}: MemoryModule.__init__() takes no arguments, got {len(args) + len(kwargs)}. "
+                "Call super().__init__(), then set self.budget, self.capacity and self.storage. Only PerceptualMemory "
+                "takes (d_vision, width, budget, storage)."
             )
         super().__init__()
 
-    def check_grid(self, views: int) -> None:
-        """Make sure that views of views×views tokens can be pooled to what this memory stores.
-
-        Raises:
-            UserError: they cannot.
-        """
-        if views % self.storage.grid:
-            sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
-            raise UserError(
-                f"memory.grid={self.storage.grid}: the backbone's {views}×{views} tokens a view pool to {sides} a side."
-            )
-
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        """Say which stored tokens step `step` remembers.
+        """Choose the stored tokens for step `step`.
 
-        Cheap, on the CPU, and the same code offline and online. Nothing later than `step` may decide.
+        Cheap, on the CPU, and the same code offline and online. It must not depend on anything later than `step`.
 
         Args:
             history: the episode so far (offline: possibly longer than `step`).
             step: index of the current frame, video included.
-            rng: randomness for training-time jitter; None where the choice must be reproducible.
+            rng: randomness for training-time jitter; None for a reproducible choice.
 
         Returns:
             int64 [n, 2] of (frame, patch) in time order, n ≤ `capacity`.
         """
         raise NotImplementedError
 
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        """Say which frames `select` may choose from, or the scorer or the backbone look at, at these steps.
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].
 
-        What is not among them need not be drawn in a simulation, nor encoded. By default all that is stored or scored;
-        a memory that looks back names the frames it looks at, which then show every camera.
+        n is `capacity`, unless `padded_length` returns less.
+        """
+        raise NotImplementedError
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        """Frames that `select`, the scorer or the backbone may read at these steps.
+
+        All other frames need not be rendered or encoded. By default all that are stored or scored; a memory with past
+        views returns the frames of these, which then show every camera.
 
         Args:
             steps: current frames, video included. exec_start: as in `History`.
@@ -128,41 +109,17 @@ class Memory(nn.Module):
             int64 [n], ascending, each once.
         """
         length = int(max(steps, default=-1)) + 1
-        return every_one([self.storage.kept_frames(length), self.frames_scored(length)])
+        return union_frames([self.storage.stored_frames(length), frames_scored(self, length)])
 
-    def frames_scored(self, length: int) -> np.ndarray:
-        """Say which of the first `length` frames the scorer has to be shown: by default all, where there is one."""
-        return np.arange(0 if self.make_scorer() is None else length)
-
-    def marked(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
-        """A selection as the backbone reads it beside a prompt: `mark` [b, n, d_vision] on what are vision tokens."""
-        return history if self.reads_motion else replace(history, features=mark(history.features))
-
-    def forward(self, history: HistoryTokens) -> MemoryTokens:
-        """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].
-
-        n is `capacity`, unless `padded_length` asks for less.
-        """
-        raise NotImplementedError
-
-    def compile(self, **options: Any) -> None:
-        """Compile in place what many small steps make slow; by default nothing is. `options` are `torch.compile`'s."""
-
-    def choose_products(self, how: str) -> None:
-        """Set `float32_products`, of members too."""
-        for module in self.modules():
-            if isinstance(module, Memory):
-                module.float32_products = how
-
-    def make_scorer(self) -> FrameScorer | None:
-        """Return a fresh scorer for one episode, or None when frames need no scores."""
-        return None
+    def condition_on_prompt(self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        """A selection as the backbone reads it with a prompt: `condition` [b, n, d_vision] of its vision tokens."""
+        return history if uses_proprio(self) else replace(history, features=condition(history.features))
 
     def padded_length(self, count: int) -> int:
-        """The length to which a selection of `count` tokens is padded; only left-padded memories may choose it."""
+        """The length to which a selection of `count` tokens is padded; only left-padded memories may change it."""
         return self.capacity
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
         """Select, gather and pad: the unbatched tokens of one step ([padded_length, …]), ready to be stacked."""
         indices = self.select(history, step, rng)
         if len(indices) > self.capacity:
@@ -179,54 +136,145 @@ class Memory(nn.Module):
             step=torch.tensor(step, device=features.device),
         )
 
-    def full_history(self, d_vision: int, device: torch.device | str = "cpu") -> HistoryTokens:
-        """A selection [1, n, d_vision] without content that is as long as one can be."""
-        n = self.padded_length(self.capacity)
-        return HistoryTokens(
-            torch.zeros(1, n, d_vision, device=device),
-            torch.zeros(1, n, 3, device=device),
-            torch.ones(1, n, dtype=torch.bool, device=device),
-            torch.zeros(1, dtype=torch.int64, device=device),
-        )
 
-    def start_history(self, encode: Callable[[np.ndarray], Tensor]) -> OnlineHistory:
-        """An episode's history, empty; `encode` takes frames [n, H, W, 3] uint8 to stored tokens."""
-        if self.lazy:
-            return LazyHistory(self.storage, encode, self.make_scorer())
-        return OnlineHistory(self.storage, self.make_scorer())
+Memory = MemoryModule
+"""The former name."""
+
+
+class StreamingMemory:
+    """Capability of a memory: it carries a state through an episode, so that a step costs its new frames alone."""
 
     def start_stream(self) -> Any:
-        """Return what this memory carries through one episode besides its history; None for nothing."""
-        return None
+        """A new state for one episode."""
+        raise NotImplementedError
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
-        """Memory tokens [n, budget, d] of n running episodes at their latest frames.
+        """Memory tokens [n, budget, d] of n running episodes at their latest frames, equal to `forward`'s.
 
         Args:
-            histories: one per episode. streams: what `start_stream` gave each of them; updated in place.
+            histories: one per episode. streams: their states, updated in place.
         """
-        return self(stack_history([self.recall(history, len(history) - 1) for history in histories]))
+        raise NotImplementedError
 
     def prepare(self, history: History, stream: Any) -> bool:
-        """Do a piece of what the next `encode` of a running episode will need, while nobody waits for it.
-
-        What comes of it may never be needed, and must change no token. By default there is nothing to prepare.
+        """Do a part of the work of the next `encode` while the robot moves. It must not change any token.
 
         Args:
             history, stream: as in `encode`, after it.
 
         Returns:
-            Whether a piece is left.
+            Whether work is left.
         """
         return False
 
 
-def every_one(lists: Sequence[np.ndarray]) -> np.ndarray:
+class ScoringMemory:
+    """Capability of a memory: it chooses by scores of raw frames."""
+
+    def make_scorer(self) -> FrameScorer | None:
+        """A new scorer for one episode; None for none."""
+        raise NotImplementedError
+
+    def frames_scored(self, length: int) -> np.ndarray:
+        """Which of the first `length` frames the scorer needs: by default all."""
+        return np.arange(length)
+
+
+class ProprioMemory:
+    """Capability of a memory: it reads proprioception and motion (`History.motion`) instead of stored tokens."""
+
+    uses_proprio: bool = True
+
+
+class PastViewMemory:
+    """Capability of a memory: it gives the backbone past views along with the current ones (`Batch.past`)."""
+
+    past_view_spec: PastViewSpec | None = None
+
+
+class CompilableMemory:
+    """Capability of a memory: it has many small operations to compile in place."""
+
+    def compile(self, **options: Any) -> None:
+        """Compile them. `options` are `torch.compile`'s."""
+        raise NotImplementedError
+
+
+class MatmulPrecision:
+    """Capability of a module that computes in float32: how a GPU multiplies there, `ieee` or `tf32`."""
+
+    float32_products: str = "ieee"
+
+
+def make_scorer(memory: MemoryModule) -> FrameScorer | None:
+    """A new scorer for one episode; None if the memory needs no scores."""
+    return memory.make_scorer() if isinstance(memory, ScoringMemory) else None
+
+
+def frames_scored(memory: MemoryModule, length: int) -> np.ndarray:
+    """Which of the first `length` frames the memory's scorer needs; int64, ascending."""
+    return memory.frames_scored(length) if isinstance(memory, ScoringMemory) else np.arange(0)
+
+
+def uses_proprio(memory: MemoryModule | None) -> bool:
+    """Whether the memory reads proprioception and motion."""
+    return isinstance(memory, ProprioMemory) and memory.uses_proprio
+
+
+def past_view_spec(memory: MemoryModule | None) -> PastViewSpec | None:
+    """The past views that the memory gives the backbone; None for none."""
+    return memory.past_view_spec if isinstance(memory, PastViewMemory) else None
+
+
+def start_stream(memory: MemoryModule | None) -> Any:
+    """A new streaming state for one episode; None if the memory has none."""
+    return memory.start_stream() if isinstance(memory, StreamingMemory) else None
+
+
+def start_history(memory: MemoryModule, encode: Callable[[np.ndarray], Tensor]) -> OnlineHistory:
+    """An empty history for one episode; `encode` maps frames [n, H, W, 3] uint8 to stored tokens."""
+    scorer = make_scorer(memory)
+    return LazyHistory(memory.storage, encode, scorer) if memory.lazy else OnlineHistory(memory.storage, scorer)
+
+
+def encode_histories(memory: MemoryModule, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+    """Memory tokens [n, budget, d] of n running episodes at their latest frames.
+
+    Args:
+        histories: one per episode. streams: their states of `start_stream`, updated in place.
+    """
+    if isinstance(memory, StreamingMemory):
+        return memory.encode(histories, streams)
+    tokens: MemoryTokens = memory(stack_history([memory.gather_selection(h, len(h) - 1) for h in histories]))
+    return tokens
+
+
+def full_history(memory: MemoryModule, d_vision: int, device: torch.device | str = "cpu") -> HistoryTokens:
+    """A selection [1, n, d_vision] of zeros at its greatest length."""
+    n = memory.padded_length(memory.capacity)
+    return HistoryTokens(
+        torch.zeros(1, n, d_vision, device=device),
+        torch.zeros(1, n, 3, device=device),
+        torch.ones(1, n, dtype=torch.bool, device=device),
+        torch.zeros(1, dtype=torch.int64, device=device),
+    )
+
+
+def check_grid(memory: MemoryModule, views: int) -> None:
+    """Raise an error unless views of views×views tokens can be pooled to the grid that the memory stores."""
+    if views % memory.storage.grid:
+        sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
+        raise UserError(
+            f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool to {sides} a side."
+        )
+
+
+def union_frames(lists: Sequence[np.ndarray]) -> np.ndarray:
     """All frames of some lists, ascending, each once; int64 [n]."""
     return np.unique(np.concatenate(lists)) if lists else np.zeros(0, np.int64)
 
 
-def whole_frames(frames: np.ndarray, grid: int) -> np.ndarray:
+def all_patches(frames: np.ndarray, grid: int) -> np.ndarray:
     """All patches of some frames as (frame, patch) [n·grid², 2], frame by frame."""
     return np.stack(np.meshgrid(frames, np.arange(grid**2), indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -237,7 +285,7 @@ def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
     An 8×8 patch y sits at 2y + 1, a 4×4 patch at 4y + 2.
     """
     frame, patch = indices[:, 0], indices[:, 1]
-    cell = LINES / grid
+    cell = POSITION_GRID / grid
     return np.stack([frame, (patch // grid + 0.5) * cell, (patch % grid + 0.5) * cell], axis=1).astype(np.float32)
 
 
@@ -253,3 +301,42 @@ def stack_history(items: Sequence[HistoryTokens], device: torch.device | None = 
     steps = [item.step for item in items if item.step is not None]
     step = torch.stack(steps).to(device) if len(steps) == len(items) else None
     return HistoryTokens(stack("features"), stack("positions"), stack("mask"), step)
+
+
+def recurrent_frames(
+    step: int, exec_start: int, max_steps: int = 64, max_video: int = 40, stride: int = 16
+) -> np.ndarray:
+    """Frames read at `step`, ascending and ending with `step`; at most `max_steps`, the earliest dropped first.
+
+    Execution frames stand `stride` apart, counted back from `step`, so the offset comes from `step` alone. Video
+    frames stand half a stride apart in a video of up to two strides, a stride apart while that gives no more than
+    `max_video`, and are spread evenly, both ends included, beyond that.
+
+    Args:
+        step: the current frame. exec_start: the first execution frame (0 without video). While the video still runs,
+            all frames before the current one count as video, so a finished episode and a running one agree.
+
+    Returns:
+        int64 [n].
+    """
+    start = min(exec_start, step)
+    execution = np.arange(start + (step - start) % stride, step + 1, stride)
+    return np.concatenate([video_frames(start, max_video, stride), execution])[-max_steps:]
+
+
+def video_frames(length: int, max_video: int, stride: int) -> np.ndarray:
+    """Frames read of a conditioning video of `length` frames."""
+    if length <= 2 * stride:
+        return np.arange(0, length, max(stride // 2, 1))
+    if length <= max_video * stride:
+        return np.arange(0, length, stride)
+    return np.linspace(0, length - 1, max_video).astype(np.int64)
+
+
+def jittered(frames: np.ndarray, exec_start: int, jitter: int, rng: np.random.Generator) -> np.ndarray:
+    """Move every frame but the last by up to `jitter` frames, video and execution each within its own part."""
+    past, step = frames[:-1], frames[-1]
+    shifted = past + rng.integers(-jitter, jitter + 1, len(past))
+    video = past < exec_start
+    low, high = np.where(video, 0, exec_start), np.where(video, min(exec_start, step) - 1, step - 1)
+    return np.append(np.unique(np.clip(shifted, low, high)), step)

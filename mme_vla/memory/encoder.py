@@ -4,6 +4,9 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.history import StorageSpec
+from mme_vla.types import HistoryTokens, MemoryTokens
 
 TEMPORAL_BASE, SPATIAL_BASE = 10_000.0, 1_000.0
 
@@ -19,9 +22,6 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
 
     Returns:
         [..., dim] float32, computed where the positions are.
-
-    Raises:
-        UserError: `dim` cannot be split in six.
     """
     w = dim // 6
     if dim % 6 or w < 2:
@@ -64,3 +64,34 @@ class FeatureEncoder(nn.Module):
     def forward(self, features: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """Encode features at positions [b, n, 3]; padding gets zero position features, not those of (0, 0, 0)."""
         return self.encode(features, position_features(positions, self.position_dim) * mask[..., None])
+
+
+class PerceptualMemory(MemoryModule):
+    """Selected tokens, right-padded to the budget and encoded one by one; subclasses choose."""
+
+    timed = True
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        budget: int,
+        storage: StorageSpec,
+        position_dim: int | None = None,
+        position_hidden: int | None = None,
+    ) -> None:
+        """Build the encoder.
+
+        Args:
+            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            budget: most memory tokens. storage: what is kept of each frame.
+            position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
+        """
+        super().__init__()
+        self.budget = self.capacity = budget
+        self.storage = storage
+        self.encoder = FeatureEncoder(d_vision, width, position_dim, position_hidden)
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        tokens = self.encoder(history.features, history.positions, history.mask)
+        return MemoryTokens(tokens, history.mask, ages=history.ages)

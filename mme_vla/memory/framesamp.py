@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import every_one, whole_frames
+from mme_vla.memory.base import all_patches, union_frames
+from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.perceptual import PerceptualMemory
 from mme_vla.registry import MEMORIES
 
 
@@ -35,9 +35,6 @@ class FrameSamp(PerceptualMemory):
 
         Args:
             every: frames 0 and k·every − 1 can be remembered; the others are neither drawn nor encoded. 1: all.
-
-        Raises:
-            UserError: the budget is not a whole number of frames.
         """
         if budget % grid**2 or budget < grid**2:
             raise UserError(
@@ -48,12 +45,12 @@ class FrameSamp(PerceptualMemory):
         self.frames = budget // grid**2
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([self.chosen(int(step)) for step in steps])
+        return union_frames([self.chosen(int(step)) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.chosen(step), self.storage.grid)
+        return all_patches(self.chosen(step), self.storage.grid)
 
     def chosen(self, step: int) -> np.ndarray:
         """The frames remembered at `step`: evenly spaced among those that are stored."""
-        stored = self.storage.kept_frames(step + 1)
+        stored = self.storage.stored_frames(step + 1)
         return stored[evenly_spaced_frames(len(stored) - 1, self.frames)]

@@ -4,15 +4,20 @@ Both forms answer the same three questions: which frames are there (`len`), what
 (`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory cannot tell them apart.
 """
 
+import ast
+import hashlib
+import inspect
+import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
+from mme_vla.types import FrameBatch
 
 
 @dataclass(frozen=True)
@@ -20,10 +25,10 @@ class StorageSpec:
     """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
 
     grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are stored); it divides the
-        backbone's (`Memory.check_grid`).
+        backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
-    scorer: name of the frame scorer whose rows are stored beside the tokens; empty for none.
+    scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`); empty for none.
     """
 
     grid: int
@@ -43,7 +48,7 @@ class StorageSpec:
         """Whether tokens of this frame are stored."""
         return frame == 0 or (frame + 1) % self.keep_every == 0
 
-    def kept_frames(self, length: int) -> np.ndarray:
+    def stored_frames(self, length: int) -> np.ndarray:
         """Ascending indices of the stored frames among the first `length`."""
         frames = np.arange(length)
         return frames[(frames == 0) | ((frames + 1) % self.keep_every == 0)]
@@ -52,12 +57,40 @@ class StorageSpec:
         return asdict(self)
 
 
-class FrameScorer(Protocol):
-    """Scores raw frames as they pass, for memories that choose by content. One instance per episode."""
+FORMER_KEYS: dict[str, str] = {}
+"""Digest of a scorer's code → the format of its key in caches that were built before keys had a digest."""
+
+
+class FrameScorer:
+    """Scores raw frames as they pass, for memories that choose by content. One instance per episode.
+
+    Subclasses are dataclasses: their fields are the options.
+    """
+
+    @classmethod
+    def digest(cls) -> str:
+        """A hash of the code of the class and its bases, without comments, docstrings and helper functions."""
+        code = []
+        for part in cls.__mro__[: cls.__mro__.index(FrameScorer)]:
+            tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
+            for node in ast.walk(tree):
+                if isinstance(node, ast.FunctionDef | ast.ClassDef) and ast.get_docstring(node) is not None:
+                    node.body = node.body[1:] or [ast.Pass()]
+            code.append(ast.unparse(tree))
+        return hashlib.sha256("\n".join(code).encode()).hexdigest()[:8]
+
+    @property
+    def key(self) -> str:
+        """The name of these scores in a cache: it follows from the class, its code and its options."""
+        options = {f.name: getattr(self, f.name) for f in fields(self) if f.init}  # type: ignore[arg-type]
+        digest = self.digest()
+        if digest in FORMER_KEYS:
+            return FORMER_KEYS[digest].format(**options)
+        return "-".join([type(self).__name__.lower(), *(f"{k}{v}" for k, v in options.items()), digest])
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²] or None."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass
@@ -81,7 +114,7 @@ class History:
     """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video).
 
     `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first `state_width` of
-    them its state; both are there for memories that say `reads_motion`.
+    them its state; both are there for a `ProprioMemory`.
     """
 
     motion: Callable[[np.ndarray], Tensor] | None = None
@@ -100,23 +133,15 @@ class History:
         raise NotImplementedError
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch).
-
-        Raises:
-            UserError: a frame lies beyond the history or was not kept.
-        """
+        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch)."""
         raise NotImplementedError
 
     def stored(self, indices: np.ndarray) -> Tensor:
         """`gather` without what a prompt does to tokens: what a selection may look at, in training as in episodes."""
         return self.gather(indices)
 
-    def moved(self, frames: np.ndarray) -> Tensor:
-        """What the robot felt and did at frames [n]: [n, w] float32.
-
-        Raises:
-            UserError: nobody noted it.
-        """
+    def motion_rows(self, frames: np.ndarray) -> Tensor:
+        """What the robot felt and did at frames [n]: [n, w] float32."""
         if self.motion is None:
             raise UserError(
                 "This memory reads the robot's own states and actions, and this history has none of them: give states "
@@ -124,18 +149,14 @@ class History:
             )
         return self.motion(frames)
 
-    def felt(self, frames: np.ndarray) -> Tensor:
-        """The robot's states at frames [n], normalised: [n, s] float32.
+    def proprio(self, frames: np.ndarray) -> Tensor:
+        """The robot's states at frames [n], normalised: [n, s] float32."""
+        return self.motion_rows(frames)[:, : self.state_width]
 
-        Raises:
-            UserError: nobody noted them.
-        """
-        return self.moved(frames)[:, : self.state_width]
-
-    def _row_of(self, frames: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        rows = np.minimum(np.searchsorted(kept, frames), max(len(kept) - 1, 0))
-        if len(frames) and (len(kept) == 0 or (kept[rows] != frames).any()):
-            lost = sorted(set(np.asarray(frames).tolist()) - set(kept.tolist()))
+    def _row_of(self, frames: np.ndarray, stored: np.ndarray) -> np.ndarray:
+        rows = np.minimum(np.searchsorted(stored, frames), max(len(stored) - 1, 0))
+        if len(frames) and (len(stored) == 0 or (stored[rows] != frames).any()):
+            lost = sorted(set(np.asarray(frames).tolist()) - set(stored.tolist()))
             raise UserError(
                 f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames and keeps frame 0 "
                 f"and every {self.spec.keep_every}th, as far as they were drawn. The memory selects frames that its "
@@ -154,13 +175,13 @@ class CachedHistory(History):
         self,
         spec: StorageSpec,
         tokens: np.ndarray,
-        kept: np.ndarray,
+        stored_frames: np.ndarray,
         length: int,
         scores: FrameScores | None = None,
         exec_start: int = 0,
     ) -> None:
         super().__init__(spec, exec_start)
-        self._tokens, self._kept, self._length = tokens, kept, length
+        self._tokens, self._stored_frames, self._length = tokens, stored_frames, length
         self._scores = scores if scores is not None else FrameScores.empty(spec.grid**2)
 
     def __len__(self) -> int:
@@ -171,7 +192,7 @@ class CachedHistory(History):
         return self._scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        rows = self._row_of(indices[:, 0], self._kept)
+        rows = self._row_of(indices[:, 0], self._stored_frames)
         picked = torch.from_numpy(np.ascontiguousarray(self._tokens[rows, indices[:, 1]]))
         return picked.view(torch.bfloat16) if picked.dtype == torch.uint16 else picked
 
@@ -186,7 +207,7 @@ class OnlineHistory(History):
         super().__init__(spec, exec_start)
         self._scorer = scorer
         self._length = 0
-        self._kept: list[int] = []
+        self._stored_frames: list[int] = []
         self._tokens: Tensor | None = None
         self._scores = FrameScores.empty(spec.grid**2)
         self._scored = 0  # rows in use
@@ -198,39 +219,39 @@ class OnlineHistory(History):
     def scores(self) -> FrameScores:
         return FrameScores(self._scores.frames[: self._scored], self._scores.values[: self._scored])
 
-    def wanted(self, count: int, drawn: np.ndarray | None = None) -> np.ndarray:
+    def to_encode(self, count: int, rendered: np.ndarray | None = None) -> np.ndarray:
         """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`.
 
         Args:
-            drawn: offsets of those that have a picture; by default all.
+            rendered: offsets of those that have an image; by default all.
         """
-        kept = self.spec.kept_frames(self._length + count)
-        kept = kept[kept >= self._length] - self._length
-        return kept if drawn is None else np.intersect1d(kept, drawn)
+        stored = self.spec.stored_frames(self._length + count)
+        stored = stored[stored >= self._length] - self._length
+        return stored if rendered is None else np.intersect1d(stored, rendered)
 
     def append(
         self,
         frames: Sequence[np.ndarray] | np.ndarray,
         tokens: Tensor,
-        drawn: np.ndarray | None = None,
+        rendered: np.ndarray | None = None,
         count: int | None = None,
     ) -> None:
         """Add frames in order.
 
         Args:
-            frames: pictures [n, H, W, 3] uint8. tokens: of the wanted ones, [wanted, patches, d_vision].
-            drawn: offsets [n] of the pictures among the frames, of which there are `count`; by default they are all.
+            frames: images [n, H, W, 3] uint8. tokens: of the wanted ones, [wanted, patches, d_vision].
+            rendered: offsets [n] of the images among the frames, of which there are `count`; by default they are all.
         """
         count = len(frames) if count is None else count
-        wanted, numbers = self.wanted(count, drawn), np.arange(count) if drawn is None else drawn
-        if len(tokens) != len(wanted):
-            raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
+        offsets, numbers = self.to_encode(count, rendered), np.arange(count) if rendered is None else rendered
+        if len(tokens) != len(offsets):
+            raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(offsets)} are kept: see wanted().")
         self._score(frames, numbers)
         if len(tokens):
-            self._grow(len(self._kept) + len(tokens), tokens)
+            self._grow(len(self._stored_frames) + len(tokens), tokens)
             assert self._tokens is not None
-            self._tokens[len(self._kept) : len(self._kept) + len(tokens)] = tokens
-            self._kept.extend((wanted + self._length).tolist())
+            self._tokens[len(self._stored_frames) : len(self._stored_frames) + len(tokens)] = tokens
+            self._stored_frames.extend((offsets + self._length).tolist())
         self._length += count
 
     def _note_score(self, frame: int, values: np.ndarray) -> None:
@@ -243,24 +264,17 @@ class OnlineHistory(History):
         self._scores.frames[self._scored], self._scores.values[self._scored] = frame, values
         self._scored += 1
 
-    def take(
-        self,
-        frames: np.ndarray,
-        encode: Callable[[np.ndarray], Tensor],
-        drawn: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
-        """Add frames in order, through `encode`: pictures [n, H, W, 3] → tokens [n, patches, d_vision]."""
-        wanted = self.wanted(len(frames) if count is None else count, drawn)
-        places = wanted if drawn is None else np.searchsorted(drawn, wanted)
-        self.append(frames, encode(frames[places]), drawn, count)
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
+        """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches, d_vision]."""
+        stored = frames.select(self.to_encode(frames.length, frames.index))
+        self.append(frames.images, encode(stored), frames.index, frames.length)
 
     def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
-        """Show the scorer the next frames that have a picture; `numbers` says which they are."""
+        """Show the scorer the next frames that have an image; `numbers` says which they are."""
         if self._scorer is None:
             return
-        shown = zip((numbers + self._length).tolist(), frames, strict=True)
-        for number, frame in shown:
+        numbered = zip((numbers + self._length).tolist(), frames, strict=True)
+        for number, frame in numbered:
             if (values := self._scorer(number, frame)) is not None:
                 self._note_score(number, values)
 
@@ -270,34 +284,94 @@ class OnlineHistory(History):
             return
         grown = like.new_empty((max(needed, 2 * capacity, 16), *like.shape[1:]))
         if self._tokens is not None:
-            grown[: len(self._kept)] = self._tokens[: len(self._kept)]
+            grown[: len(self._stored_frames)] = self._tokens[: len(self._stored_frames)]
         self._tokens = grown
 
     def gather(self, indices: np.ndarray) -> Tensor:
         if self._tokens is None:
             raise UserError("The history is empty: observe at least one frame before acting.")
-        rows = self._row_of(indices[:, 0], np.asarray(self._kept, np.int64))
+        rows = self._row_of(indices[:, 0], np.asarray(self._stored_frames, np.int64))
         device = self._tokens.device
         return self._tokens[torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)]
 
 
-class MarkedHistory(History):
-    """A history whose tokens go through `mark` [n, d_vision] → [n, d_vision] as they are gathered."""
+class PromptConditionedHistory(History):
+    """A history whose tokens are changed by `condition` [n, d_vision] → [n, d_vision] as they are gathered."""
 
-    def __init__(self, whole: History, mark: Callable[[Tensor], Tensor]) -> None:
-        super().__init__(whole.spec, whole.exec_start)
-        self._whole, self._mark = whole, mark
-        self.motion, self.state_width = whole.motion, whole.state_width
+    def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
+        super().__init__(source.spec, source.exec_start)
+        self._source, self._condition = source, condition
+        self.motion, self.state_width = source.motion, source.state_width
 
     def __len__(self) -> int:
-        return len(self._whole)
+        return len(self._source)
 
     @property
     def scores(self) -> FrameScores:
-        return self._whole.scores
+        return self._source.scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._mark(self._whole.gather(indices))
+        return self._condition(self._source.gather(indices))
 
     def stored(self, indices: np.ndarray) -> Tensor:
-        return self._whole.stored(indices)
+        return self._source.stored(indices)
+
+
+class LazyHistory(OnlineHistory):
+    """Frames wait as images in the CPU's memory; their tokens stay on the device that encoded them.
+
+    A recurrent memory reads one frame in sixteen: the vision tower then runs sixteen times less. An image of 256×256
+    takes 192 KiB, less than its 8×8 tokens at full width would on the GPU.
+
+    Args:
+        encode: frames [n, H, W, 3] uint8 → tokens [n, patches, d_vision].
+    """
+
+    def __init__(
+        self,
+        spec: StorageSpec,
+        encode: Callable[[np.ndarray], Tensor],
+        scorer: FrameScorer | None = None,
+        exec_start: int = 0,
+    ) -> None:
+        super().__init__(spec, scorer, exec_start)
+        self._encode = encode
+        self._waiting: dict[int, np.ndarray] = {}
+        self._encoded: dict[int, Tensor] = {}
+
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
+        """Add frames in order, without encoding any."""
+        offsets = self.to_encode(frames.length, frames.index)
+        # Copies: a view would keep the whole message alive that a frame came in.
+        new = {
+            int(frame): image.copy()
+            for frame, image in zip(offsets + self._length, frames.select(offsets), strict=True)
+        }
+        self._score(frames.images, frames.index)
+        self._waiting |= new
+        self._stored_frames += new
+        self._length += frames.length
+
+    def append(
+        self,
+        frames: Sequence[np.ndarray] | np.ndarray,
+        tokens: Tensor,
+        rendered: np.ndarray | None = None,
+        count: int | None = None,
+    ) -> None:
+        """Add frames whose tokens are there already."""
+        raise TypeError("A LazyHistory encodes its frames itself: give them to take().")
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch), encoding the frames that wait."""
+        frames, rows = np.unique(indices[:, 0], return_inverse=True)
+        self._row_of(frames, np.asarray(self._stored_frames, np.int64))  # says which frames are missing
+        new = [int(frame) for frame in frames if int(frame) in self._waiting]
+        if new:
+            tokens = self._encode(np.stack([self._waiting[frame] for frame in new]))
+            for frame, row in zip(new, tokens, strict=True):
+                self._encoded[frame] = row
+                del self._waiting[frame]
+        read = torch.stack([self._encoded[int(frame)] for frame in frames])
+        places = (torch.as_tensor(part, device=read.device) for part in (rows, indices[:, 1]))
+        return read[tuple(places)]

@@ -10,16 +10,31 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import LooksBack, Memory, every_one
+from mme_vla.memory.base import (
+    CompilableMemory,
+    MemoryModule,
+    PastViewMemory,
+    PastViewSpec,
+    ProprioMemory,
+    ScoringMemory,
+    StreamingMemory,
+    encode_histories,
+    frames_scored,
+    make_scorer,
+    past_view_spec,
+    start_stream,
+    union_frames,
+    uses_proprio,
+)
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
-WHOLE = 16  # shares are multiples of it, so that they hold whole frames of the smaller grids
+SHARE_UNIT = 16  # shares are multiples of it, so that they hold whole frames of the smaller grids
 
 
 @MEMORIES.register("joined")
-class JoinedMemory(Memory):
+class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, PastViewMemory, CompilableMemory):
     """Each member selects and encodes as if it were alone, within its share of the budget.
 
     The history keeps what serves all of them: a grid of which all of theirs are pooled when they are read
@@ -36,13 +51,10 @@ class JoinedMemory(Memory):
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             members: names, or sections with `name` and the memory's own options.
             budget: most memory tokens of all together. Members that name no budget share evenly what the others leave.
-
-        Raises:
-            UserError: fewer than two members, more budget than there is, or members that want frames stored unlike.
         """
         super().__init__()
         sections = shares(members, budget)
-        built: list[Memory] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
+        built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
         self.members = nn.ModuleList(built)
         self.names = _distinct([section["name"] for section in sections])
         self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
@@ -50,61 +62,64 @@ class JoinedMemory(Memory):
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
         self.timed = all(member.timed for member in built)
-        self.reads_motion = any(member.reads_motion for member in built)
+        self.uses_proprio = any(uses_proprio(member) for member in built)
         self.lazy = all(member.lazy for member in built)
-        self.looks_back = one_look_back({n: m.looks_back for n, m in zip(self.names, built, strict=True)})
+        self.past_view_spec = single_past_view_spec(
+            {n: past_view_spec(m) for n, m in zip(self.names, built, strict=True)}
+        )
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
     def compile(self, **options: Any) -> None:
         for member in self.memories:
-            member.compile(**options)
+            if isinstance(member, CompilableMemory):
+                member.compile(**options)
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """What any member remembers, as the stored tokens it is made of."""
-        chosen = [
-            finer(member.select(seen, step, rng), member.storage.grid, self.storage.grid)
-            for member, seen in zip(self.memories, self._views(history), strict=True)
+        indices = [
+            finer(member.select(view, step, rng), member.storage.grid, self.storage.grid)
+            for member, view in zip(self.memories, self._views(history), strict=True)
         ]
-        return np.unique(np.concatenate(chosen), axis=0)
+        return np.unique(np.concatenate(indices), axis=0)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([member.frames_read(steps, exec_start) for member in self.memories])
+        return union_frames([member.frames_read(steps, exec_start) for member in self.memories])
 
     def frames_scored(self, length: int) -> np.ndarray:
-        return every_one([member.frames_scored(length) for member in self.memories])
+        return union_frames([frames_scored(member, length) for member in self.memories])
 
     def make_scorer(self) -> FrameScorer | None:
         for member in self.memories:
-            scorer = member.make_scorer()
+            scorer = make_scorer(member)
             if scorer is not None:
-                return _Spread(scorer, member.storage.grid, self.storage.grid)
+                return _Upsampled(scorer, member.storage.grid, self.storage.grid)
         return None
 
     def padded_length(self, count: int) -> int:
         first, *others = (self.memories[i] for i in self._order)
         return first.padded_length(min(count, first.capacity)) + sum(member.capacity for member in others)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
         memories, views = self.memories, self._views(history)
         parts = []
         for place, i in enumerate(self._order):
-            part = memories[i].recall(views[i], step, rng)
+            part = memories[i].gather_selection(views[i], step, rng)
             parts.append(_padded(part, memories[i]) if place else part)
         features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
         return HistoryTokens(features, positions, mask, parts[0].step)
 
-    def marked(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
-        parts = [self.memories[i].marked(piece, mark) for i, piece in self._pieces(history)]
+    def condition_on_prompt(self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        parts = [self.memories[i].condition_on_prompt(piece, condition) for i, piece in self._pieces(history)]
         return replace(history, features=torch.cat([part.features for part in parts], 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
-        found: dict[int, MemoryTokens] = {}
+        outputs: dict[int, MemoryTokens] = {}
         for i, piece in self._pieces(history):
             memories[i].reporting = self.reporting
-            found[i] = memories[i](piece)
-        return self._joined([found[i] for i in range(len(memories))])
+            outputs[i] = memories[i](piece)
+        return self._joined([outputs[i] for i in range(len(memories))])
 
     def _pieces(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
         """Each member's number and selection, in the order in which they lie."""
@@ -114,36 +129,37 @@ class JoinedMemory(Memory):
         return [(i, HistoryTokens(f, p, m, history.step)) for i, (f, p, m) in zip(self._order, pieces, strict=True)]
 
     def start_stream(self) -> tuple[Any, ...]:
-        return tuple(member.start_stream() for member in self.memories)
+        return tuple(start_stream(member) for member in self.memories)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         views = [self._views(history) for history in histories]
         return self._joined([
-            member.encode([view[i] for view in views], [stream[i] for stream in streams])
+            encode_histories(member, [view[i] for view in views], [stream[i] for stream in streams])
             for i, member in enumerate(self.memories)
         ])  # fmt: skip
 
     def prepare(self, history: History, stream: Any) -> bool:
         members = zip(self.memories, self._views(history), stream, strict=True)
-        return sum(member.prepare(view, own) for member, view, own in members) > 0  # a piece of each
+        left = [m.prepare(view, piece) for m, view, piece in members if isinstance(m, StreamingMemory)]
+        return any(left)
 
     @property
-    def memories(self) -> list[Memory]:
+    def memories(self) -> list[MemoryModule]:
         """The members, in their order."""
-        return [member for member in self.members if isinstance(member, Memory)]
+        return [member for member in self.members if isinstance(member, MemoryModule)]
 
     def _views(self, history: History) -> list[History]:
         return [CoarserHistory(history, member.storage) for member in self.memories]
 
-    def _joined(self, found: Sequence[MemoryTokens]) -> MemoryTokens:
+    def _joined(self, outputs: Sequence[MemoryTokens]) -> MemoryTokens:
         metrics = {
             f"{name}/{key}": value
-            for name, tokens in zip(self.names, found, strict=True)
+            for name, tokens in zip(self.names, outputs, strict=True)
             for key, value in tokens.metrics.items()
         }
-        told = [f.ages for f in found if f.ages is not None]
-        ages = torch.cat(told, 1) if len(told) == len(found) else None
-        tokens, mask = torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1)
+        member_ages = [f.ages for f in outputs if f.ages is not None]
+        ages = torch.cat(member_ages, 1) if len(member_ages) == len(outputs) else None
+        tokens, mask = torch.cat([f.tokens for f in outputs], 1), torch.cat([f.mask for f in outputs], 1)
         return MemoryTokens(tokens, mask, metrics, ages)
 
 
@@ -174,14 +190,14 @@ class CoarserHistory(History):
 
     def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
         parts = (self._stored.spec.grid // self.spec.grid) ** 2
-        found = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
+        pooled = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
         if parts == 1:
-            return found
-        cells = found.unflatten(0, (-1, parts)).float()
-        return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(found.dtype)
+            return pooled
+        cells = pooled.unflatten(0, (-1, parts)).float()
+        return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(pooled.dtype)
 
 
-class _Spread:
+class _Upsampled(FrameScorer):
     """A member's scorer, its rows spread over the finer grid that is stored."""
 
     def __init__(self, scorer: FrameScorer, grid: int, fine: int) -> None:
@@ -205,11 +221,7 @@ def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
 
 
 def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict[str, Any]]:
-    """Every member's section, with a budget: its own, or an even share of what the others leave.
-
-    Raises:
-        UserError: fewer than two members, one that is no memory's section, or more budget than there is.
-    """
+    """Every member's section, with a budget: its own, or an even share of what the others leave."""
     if isinstance(members, str | Mapping) or len(members) < 2:
         raise UserError(f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].")
     sections: list[dict[str, Any]] = [dict(m) if isinstance(m, Mapping) else {"name": m} for m in members]
@@ -219,21 +231,17 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
     taken = sum(section.get("budget") or 0 for section in sections)
     open_ones = [section for section in sections if section.get("budget") is None]
     share = (budget - taken) // max(len(open_ones), 1)
-    share -= share % WHOLE if share >= WHOLE else 0
+    share -= share % SHARE_UNIT if share >= SHARE_UNIT else 0
     if taken > budget or (open_ones and share < 1):
-        asked = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
+        requested = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
         raise UserError(
-            f"memory.budget={budget} is less than what its members ask for ({asked}): lower their budgets, or raise it."
+            f"memory.budget={budget} is less than its members use ({requested}): lower their budgets, or raise it."
         )
     return [{**section, "budget": share} if section in open_ones else section for section in sections]
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
-    """What has to be stored so that every one of these memories finds what it wants.
-
-    Raises:
-        UserError: they pool differently, or more than one scores frames.
-    """
+    """What has to be stored so that every one of these memories finds what it wants."""
     (first, one), *_ = specs.items()
     for name, other in specs.items():
         if other.pooling != one.pooling:
@@ -252,19 +260,15 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
     return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
 
 
-def one_look_back(looks: Mapping[str, LooksBack | None]) -> LooksBack | None:
-    """What the one member gives that looks back; None where none does.
-
-    Raises:
-        UserError: several do, and a tower looks back in one way.
-    """
-    found = {name: look for name, look in looks.items() if look is not None}
-    if len(found) > 1:
-        raise UserError(f"{' and '.join(found)} each give the vision tower past views: join only one of them.")
-    return next(iter(found.values()), None)
+def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
+    """What the one member gives that looks back; None where none does."""
+    defined = {name: spec for name, spec in specs.items() if spec is not None}
+    if len(defined) > 1:
+        raise UserError(f"{' and '.join(defined)} each give the vision tower past views: join only one of them.")
+    return next(iter(defined.values()), None)
 
 
-def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:
+def _padded(part: HistoryTokens, member: MemoryModule) -> HistoryTokens:
     """A selection at its member's capacity."""
     missing = member.capacity - len(part.mask)
     ends = (missing, 0) if member.pad_left else (0, missing)

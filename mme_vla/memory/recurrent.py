@@ -1,11 +1,12 @@
-"""What the two recurrent memories share: frame after frame enters a small state, and the state is what is read.
+"""Base of the recurrent memories: frames update a small state, and the state is read as memory tokens.
 
-Two forms of the same computation: `forward` runs a whole window, for training and for ready batches; `init_state`,
-`update` and `read` take it frame by frame. `remember` uses the second while an episode's frame list grows.
+Two forms of the same computation: `forward` runs a full window, for training; `init_state`, `update` and `read` take it
+frame by frame, which `encode` uses while an episode's frame list grows.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -16,12 +17,74 @@ from torch.utils.checkpoint import checkpoint
 
 from mme_vla.config.devices import float32_products
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, every_one, token_positions, whole_frames
+from mme_vla.memory.base import (
+    CompilableMemory,
+    MatmulPrecision,
+    MemoryModule,
+    StreamingMemory,
+    all_patches,
+    jittered,
+    recurrent_frames,
+    token_positions,
+    union_frames,
+)
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.sampling import jittered, recurrent_frames
-from mme_vla.memory.streams import RecurrentStream, State, Taken, pieces
 from mme_vla.types import HistoryTokens, MemoryTokens
+
+State = tuple[Tensor, ...]
+"""What is carried from frame to frame; each tensor [b, …]."""
+
+MAX_SNAPSHOTS = 4
+"""States kept of an episode: replans every quarter, half, three quarters or whole of a stride all continue one."""
+
+
+@dataclass(eq=False)
+class Taken:
+    """A state (None before the first frame) and the frames [n] that it has taken, in order."""
+
+    frames: np.ndarray
+    state: State | None = None
+
+
+@dataclass
+class RecurrentStream:
+    """How far one episode's recurrence has come.
+
+    kept: the last used is the last one. updates: frames taken since the episode began, repeated ones included.
+    asked: the step of the last decision. pace: frames from the decision before it to that one.
+    """
+
+    snapshots: list[Taken] = field(default_factory=list)
+    updates: int = 0
+    last_step: int | None = None
+    pace: int | None = None
+
+    def decides(self, step: int) -> None:
+        """Note that a decision is made at `step`."""
+        if self.last_step is not None and step > self.last_step:
+            self.pace = step - self.last_step
+        self.last_step = step
+
+    def continued(self, frames: np.ndarray) -> Taken:
+        """The state that has taken the longest beginning of these frames; a fresh one where none has."""
+        fitting = [taken for taken in self.snapshots if np.array_equal(frames[: len(taken.frames)], taken.frames)]
+        best = max(fitting, key=lambda taken: len(taken.frames), default=Taken(frames[:0]))
+        self.snapshots = [*(taken for taken in self.snapshots if taken is not best), best][-MAX_SNAPSHOTS:]
+        return best
+
+
+def pieces(count: int, chunk: int) -> Iterator[int]:
+    """How many frames enter together: chunks, and the newest alone.
+
+    A state that was prepared before the newest frame was there has so been through the same steps, to the bit, as one
+    that takes them all at once.
+    """
+    for start in range(0, count - 1, chunk):
+        yield min(chunk, count - 1 - start)
+    if count:
+        yield 1
+
 
 Statistics = dict[str, Tensor]
 """Numbers about each step, [b, t], detached."""
@@ -61,7 +124,7 @@ class RecurrentLayer(nn.Module):
         return {}
 
 
-class RecurrentMemory(Memory):
+class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPrecision):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
 
     pad_left = True
@@ -96,9 +159,6 @@ class RecurrentMemory(Memory):
                 randomness (`data.jitter`).
             chunk: frames that are recomputed together in the backward pass; windows are padded to a multiple of it.
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         super().__init__()
         sizes = {"max_steps": max_steps, "max_video": max_video, "stride": stride, "chunk": chunk}
@@ -129,10 +189,10 @@ class RecurrentMemory(Memory):
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         limits = (self.max_steps, self.max_video, self.stride)
-        return every_one([recurrent_frames(int(step), exec_start, *limits) for step in steps])
+        return union_frames([recurrent_frames(int(step), exec_start, *limits) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.frames(history, step, rng), self.storage.grid)
+        return all_patches(self.frames(history, step, rng), self.storage.grid)
 
     def padded_length(self, count: int) -> int:
         """Whole chunks: the steps of a short episode are few, and nothing changes but the time they take."""
@@ -237,9 +297,9 @@ class RecurrentMemory(Memory):
         to do where its list does not extend one that was taken: once a list is full its first frames go, and the
         released computation begins anew behind them at every decision.
         """
-        if stream.asked is None:
+        if stream.last_step is None:
             return False
-        expected = self.frames(history, stream.asked + (stream.pace or self.stride))[:-1]
+        expected = self.frames(history, stream.last_step + (stream.pace or self.stride))[:-1]
         expected = expected[expected < len(history)]
         if not len(expected):
             return False
@@ -253,7 +313,7 @@ class RecurrentMemory(Memory):
     def _enter(self, group: Sequence[tuple[History, Taken, np.ndarray]]) -> None:
         """Let equally many new frames enter each of these states."""
         state = _stack([taken.state or self.init_state(1) for _, taken, _ in group])
-        indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
+        indices = [all_patches(new, self.storage.grid) for _, _, new in group]
         features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
         positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
         everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)

@@ -76,16 +76,16 @@ class RMTLayer(RecurrentLayer):
         with full_precision(x):
             (slots,), patches, changes = state, x.shape[2], []
             # Recomputed, not stored: frame tokens come first, and any number of slots after them.
-            turn = angles(patches + slots.shape[1], self.head_dim, x.device)
-            of_frame, of_slots = turn[:patches], turn[patches:]
+            rope = angles(patches + slots.shape[1], self.head_dim, x.device)
+            of_frame, of_slots = rope[:patches], rope[patches:]
             frame_k, frame_v = self._keys_values(layer_norm(self.pre_norm, x.float()), of_frame)  # b t p kv h
             for t in range(x.shape[1]):
-                seen = layer_norm(self.pre_norm, slots.float())
-                k, v = self._keys_values(seen, of_slots)
+                normed = layer_norm(self.pre_norm, slots.float())
+                k, v = self._keys_values(normed, of_slots)
                 k, v = torch.cat([frame_k[:, t], k], 1), torch.cat([frame_v[:, t], v], 1)
-                q = self._rotate(linear(self.q, seen).unflatten(-1, (-1, self.head_dim)), of_slots)
-                answer = linear(self.out, self._attend(q, k, v)) + slots.float()
-                updated = layer_norm(self.post_norm, answer).to(slots.dtype)
+                q = self._rotate(linear(self.q, normed).unflatten(-1, (-1, self.head_dim)), of_slots)
+                output = linear(self.out, self._attend(q, k, v)) + slots.float()
+                updated = layer_norm(self.post_norm, output).to(slots.dtype)
                 new = torch.where(valid[:, t, None, None], updated, slots)
                 if statistics:
                     changes.append(_relative_distance(slots, new))
@@ -96,13 +96,13 @@ class RMTLayer(RecurrentLayer):
         (slots,) = state
         return slots, torch.ones(slots.shape[:2], dtype=torch.bool, device=slots.device)
 
-    def _keys_values(self, x: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+    def _keys_values(self, x: Tensor, rope: Tensor) -> tuple[Tensor, Tensor]:
         k, v = linear(self.kv, x).unflatten(-1, (2 * self.kv_heads, self.head_dim)).chunk(2, -2)
-        return self._rotate(k, turn), v
+        return self._rotate(k, rope), v
 
-    def _rotate(self, x: Tensor, turn: Tensor) -> Tensor:
+    def _rotate(self, x: Tensor, rope: Tensor) -> Tensor:
         """Turn the pairs (2i, 2i + 1) of [..., n, heads, h] by angles [n, h/2]."""
-        cos, sin = turn.cos()[:, None], turn.sin()[:, None]
+        cos, sin = rope.cos()[:, None], rope.sin()[:, None]
         a, b = x[..., 0::2], x[..., 1::2]
         if self.rotation == "cosine_only":
             return torch.stack([a * cos, b * cos], -1).flatten(-2)
@@ -163,9 +163,6 @@ class RMT(RecurrentMemory):
                 imaginary part of the rotary table.
             attention_dtype: what queries, keys and values are cast to; `bfloat16` as released; `float32` takes
                 the fused kernel, which keeps no weights: less memory.
-
-        Raises:
-            UserError: sizes that do not fit together, or an unknown choice.
         """
         if budget < 1:
             raise UserError(f"memory.budget={budget} must be at least 1.")

@@ -1,34 +1,35 @@
 """TokenDrop: the first frame whole, then the patches that changed most (paper, section 4.2)."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.memory.history import FrameScores, History, StorageSpec
-from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.memory.base import ScoringMemory
+from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 
 FIRST_FRAME_SCORE = 1000.0  # above any change, so that the first frame always stays
 THRESHOLD = 1e-4  # patches that changed less are never candidates
 
 
-class ChangeScorer:
+@dataclass
+class ChangeScorer(FrameScorer):
     """Mean |ΔRGB| per patch, in units of [−1, 1], between every `stride`-th frame and the one scored before it.
 
     Frames stride−1, 2·stride−1, … are scored; the first of them against frame 0, as released.
     """
 
-    def __init__(self, grid: int, stride: int) -> None:
-        self.grid, self.stride = grid, stride
+    grid: int
+    stride: int
+
+    def __post_init__(self) -> None:
         self._reference: np.ndarray | None = None
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
-        """Score one frame [H, W, 3] uint8, or keep it as a reference.
-
-        Raises:
-            UserError: the frame does not divide into grid×grid patches.
-        """
+        """Score one frame [H, W, 3] uint8, or keep it as a reference."""
         if frame_index and (frame_index + 1) % self.stride:
             return None
         height, width, _ = frame.shape
@@ -44,8 +45,11 @@ class ChangeScorer:
         return cells.mean(axis=(1, 3, 4), dtype=np.float32).reshape(-1)
 
 
+FORMER_KEYS["4a0a7e45"] = "change{grid}x{grid}-every{stride}"
+
+
 @MEMORIES.register("tokendrop")
-class TokenDrop(PerceptualMemory):
+class TokenDrop(PerceptualMemory, ScoringMemory):
     """The `budget` highest-scored patches up to now, the first frame's among them, in time order."""
 
     def __init__(
@@ -67,9 +71,6 @@ class TokenDrop(PerceptualMemory):
             candidates: length of the list of best patches that is kept along an episode.
             causal: only frames up to the current one compete for that list. False lets the whole episode compete,
                 as the released offline preprocessing does; it needs a finished episode.
-
-        Raises:
-            UserError: the budget does not hold the first frame, or exceeds the candidates.
         """
         if stride < 1:
             raise UserError(f"memory.stride={stride} must be at least 1: the frames between two that are scored.")
@@ -78,7 +79,7 @@ class TokenDrop(PerceptualMemory):
                 f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
                 f"memory.candidates={candidates} (the patches a running list holds)."
             )
-        storage = StorageSpec(grid, pooling, keep_every=stride, scorer=f"change{grid}x{grid}-every{stride}")
+        storage = StorageSpec(grid, pooling, keep_every=stride, scorer=ChangeScorer(grid, stride).key)
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.stride, self.candidates, self.causal = stride, candidates, causal
 
@@ -86,7 +87,7 @@ class TokenDrop(PerceptualMemory):
         return ChangeScorer(self.storage.grid, self.stride)
 
     def frames_scored(self, length: int) -> np.ndarray:
-        return self.storage.kept_frames(length)
+        return self.storage.stored_frames(length)
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         patches = self.storage.grid**2
@@ -115,5 +116,5 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
 
 def most_changed(ranked: np.ndarray, step: int, budget: int) -> np.ndarray:
     """The last `budget` of the ranked patches that lie no later than `step`, in time order."""
-    chosen = ranked[ranked[:, 0] <= step][-budget:]
-    return chosen[np.lexsort((chosen[:, 1], chosen[:, 0]))]
+    selected = ranked[ranked[:, 0] <= step][-budget:]
+    return selected[np.lexsort((selected[:, 1], selected[:, 0]))]

@@ -26,10 +26,10 @@ Weights = tuple[Tensor, Tensor]
 """W [b, h, w, w] and b [b, h, w] of the inner models."""
 
 
-class Answer(NamedTuple):
+class InnerOutput(NamedTuple):
     """The inner model's answer at some tokens, and what the gradient needs of the way there."""
 
-    answer: Tensor
+    output: Tensor
     unit: Tensor  # z / rms(z)
     inverse_rms: Tensor  # 1 / rms(z)
 
@@ -82,15 +82,15 @@ class TTTLayer(RecurrentLayer):
     def initial(self, batch: int) -> State:
         window = -(-self.budget // self.patches)
         outputs = self.weight.new_zeros(batch, window, self.patches, self.out.out_features, dtype=torch.float32)
-        seen = torch.zeros(batch, window, dtype=torch.bool, device=outputs.device)
+        window_valid = torch.zeros(batch, window, dtype=torch.bool, device=outputs.device)
         weight, bias = (p.expand(batch, *p.shape) for p in (self.weight, self.bias))
-        return weight, bias, outputs, seen
+        return weight, bias, outputs, window_valid
 
     def advance(
         self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
     ) -> tuple[State, Statistics]:
         with full_precision(x):
-            weight, bias, outputs, seen = state
+            weight, bias, outputs, window_valid = state
             steps, window = x.shape[1], outputs.shape[1]
             x = x.float()
             k = layer_norm(self.k_norm, self._by_head(linear(self.k, x)))  # b t h p w
@@ -109,25 +109,25 @@ class TTTLayer(RecurrentLayer):
                 weight = torch.where(real[..., None], updated[0], weight)
                 bias = torch.where(real, updated[1], bias)
                 if t >= first_read:
-                    asked = q[:, t - first_read]
-                    answer = self.inner(weight, bias, asked).answer + asked
-                    answers.append(torch.where(real[..., None], answer, 0))
+                    query = q[:, t - first_read]
+                    output = self.inner(weight, bias, query).output + query
+                    answers.append(torch.where(real[..., None], output, 0))
                 if statistics:
                     numbers.append(self._statistics(before, (weight, bias), k[:, t], v[:, t], updated[2]))
             if read:
                 mixed = torch.stack(answers, 1).transpose(2, 3).flatten(3)  # b t p d
                 y = x[:, first_read:] + linear(self.out, layer_norm(self.out_norm, mixed))
                 outputs = torch.cat([outputs, y], 1)[:, -window:]
-                seen = torch.cat([seen, valid[:, first_read:]], 1)[:, -window:]
+                window_valid = torch.cat([window_valid, valid[:, first_read:]], 1)[:, -window:]
             per_step = {name: torch.stack([n[name] for n in numbers], 1) for name in (numbers[0] if numbers else ())}
             if statistics:
                 per_step["step_size"] = rate.detach().mean((2, 3, 4))
                 per_step["clipped_rates"] = (raw.detach() > self.max_rate).float().mean((2, 3))
-            return (weight, bias, outputs, seen), per_step
+            return (weight, bias, outputs, window_valid), per_step
 
     def read(self, state: State) -> tuple[Tensor, Tensor]:
-        _, _, outputs, seen = state
-        mask = seen[..., None].expand(*seen.shape, self.patches)
+        _, _, outputs, window_valid = state
+        mask = window_valid[..., None].expand(*window_valid.shape, self.patches)
         return outputs.flatten(1, 2)[:, -self.budget :], mask.flatten(1)[:, -self.budget :]
 
     def summary(self, start: State, end: State) -> dict[str, Tensor]:
@@ -135,18 +135,18 @@ class TTTLayer(RecurrentLayer):
         change = (after - before).flatten(1).norm(dim=1) / before.flatten(1).norm(dim=1)
         return {"weight_change": change.mean()}
 
-    def inner(self, weight: Tensor, bias: Tensor, at: Tensor) -> Answer:
+    def inner(self, weight: Tensor, bias: Tensor, at: Tensor) -> InnerOutput:
         """The inner model at tokens [b, h, p, w]."""
         z = at @ weight.float() + bias.float()[:, :, None]
         inverse_rms = torch.rsqrt(z.square().mean(-1, keepdim=True) + INNER_EPS)
         unit = z * inverse_rms
         scale, shift = self.inner_norm.float().unbind(1)
-        return Answer(unit * (1 + scale[:, None]) + shift[:, None], unit, inverse_rms)
+        return InnerOutput(unit * (1 + scale[:, None]) + shift[:, None], unit, inverse_rms)
 
     def learn(self, weight: Tensor, bias: Tensor, k: Tensor, v: Tensor, rate: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One gradient step on one frame: new W, new b, and the norms of both gradients [b, h, 2] before clipping."""
-        answer, unit, inverse_rms = self.inner(weight, bias, k)
-        error = (answer - (v - k)) * (1 + self.inner_norm[:, 0, None].float())
+        output, unit, inverse_rms = self.inner(weight, bias, k)
+        error = (output - (v - k)) * (1 + self.inner_norm[:, 0, None].float())
         delta = rate * inverse_rms * (error - unit * (error * unit).mean(-1, keepdim=True))  # b h p w
         of_weight, of_bias = k.transpose(-1, -2) @ delta, delta.sum(-2)
         norms = torch.stack(
@@ -160,7 +160,7 @@ class TTTLayer(RecurrentLayer):
     @torch.no_grad()
     def _statistics(self, before: Weights, after: Weights, k: Tensor, v: Tensor, norms: Tensor) -> Statistics:
         def loss(weights: Weights) -> Tensor:
-            return (self.inner(*weights, k).answer - (v - k)).square().mean((1, 2, 3))
+            return (self.inner(*weights, k).output - (v - k)).square().mean((1, 2, 3))
 
         return {
             "inner_loss_before": loss(before),
@@ -196,9 +196,6 @@ class TTT(RecurrentMemory):
             hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64. heads: inner models.
             base_rate: inner learning rate at the start. max_rate: its ceiling, per token and head.
             max_grad_norm: ceiling of an inner gradient's norm.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         if not 0 < budget <= max_steps * grid**2:
             raise UserError(

@@ -1,7 +1,7 @@
-"""Demonstrations drawn only where somebody looks: at the decisions, and at the frames that memories remember there.
+"""Demonstrations rendered only at their decisions, and at the frames that memories read there.
 
-An episode of planned motions has a handful of decisions, known when it is over. Where everything stood is kept of every
-frame; then the frames that are wanted are put back and drawn. That takes a second where drawing all takes ten.
+An episode of planned motions has a handful of decisions, known when it is over. The poses of every frame are kept; then
+the required frames are restored and rendered. That takes a second where rendering all takes ten.
 """
 
 import json
@@ -13,30 +13,70 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.waypoints import Motions
-from mme_vla.embodiment.options import Option, read_options
-from mme_vla.embodiment.robomme import benchmark_action, benchmark_state
+from mme_vla.embodiment.action_space import Option, read_options
+from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
-from mme_vla.files import parse_json, write_atomically
-from mme_vla.nano.snapshots import Snapshots
+from mme_vla.envs.observations import RenderRequest, capture, read_images
 from mme_vla.subgoal.oracle import online_subgoal
+from mme_vla.utils import parse_json, write_atomically
 
 if TYPE_CHECKING:
-    from mme_vla.embodiment.actions import ActionSpace
+    from mme_vla.embodiment.action_space import ActionSpace
     from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
+
+class Snapshots:
+    """Snapshots of one task's scene, in the order they were taken; velocities are not part of them.
+
+    A snapshot is read from the simulator's own objects: that takes a tenth of what `get_state_dict` takes, and brings
+    back marks and traces, which belong to no thing of the task.
+    """
+
+    def __init__(self, task: "Task") -> None:
+        from sapien.render import RenderBodyComponent
+
+        entities = [actor._objs[0] for actor in task.scene.actors.values() if actor.px_body_type != "static"]
+        self._entities = entities
+        bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in entities]
+        self._bodies = [body for body in bodies if body is not None]
+        self._articulations = [each._objs[0] for each in task.scene.articulations.values()]
+        self._taken: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
+
+    def __len__(self) -> int:
+        return len(self._taken)
+
+    def take(self) -> None:
+        """Keep the scene as it stands."""
+        self._taken.append((
+            [entity.pose for entity in self._entities],
+            [body.visibility for body in self._bodies],
+            [(each.root_pose, each.qpos) for each in self._articulations],
+        ))  # fmt: skip
+
+    def put_back(self, number: int) -> None:
+        """Make the scene stand as in a snapshot, counted from 0."""
+        poses, visibilities, joints = self._taken[number]
+        for entity, pose in zip(self._entities, poses, strict=True):
+            entity.pose = pose
+        for body, visibility in zip(self._bodies, visibilities, strict=True):
+            body.visibility = visibility
+        for each, (root, qpos) in zip(self._articulations, joints, strict=True):
+            each.root_pose = root
+            each.qpos = qpos
+
+
 SUBGOALS = ("simple", "grounded")
-CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode of a task, with pictures of some frames.
+    """One episode of a task, with images of some frames.
 
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
     subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
-    time. pictures: camera → frame → [256, 256, 3] uint8.
+    time. images: camera → frame → [256, 256, 3] uint8.
     """
 
     task: str
@@ -47,7 +87,7 @@ class Demonstration:
     exec_start: int
     states: np.ndarray
     motions: Motions
-    pictures: dict[str, dict[int, np.ndarray]]
+    images: dict[str, dict[int, np.ndarray]]
     subgoals: dict[str, list[str]] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
@@ -55,31 +95,31 @@ class Demonstration:
         names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals")
         about = {name: getattr(self, name) for name in names}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
-        for camera, taken in self.pictures.items():
+        for camera, taken in self.images.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
             arrays[f"{camera}_pictures"] = np.stack(list(taken.values()))
         with write_atomically(path) as draft, draft.open("wb") as file:
             np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path: Path, pictures: bool = True) -> "Demonstration":
-        """Read what `save` wrote, or what of it is no picture."""
+    def load(cls, path: Path, images: bool = True) -> "Demonstration":
+        """Read what `save` wrote, or what of it is no image."""
         with np.load(path) as file:
-            drawn = {
+            loaded_images = {
                 camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
                 for camera in CAMERAS
-                if pictures and f"{camera}_frames" in file
+                if images and f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
-            return cls(**about, states=file["states"], motions=motions, pictures=drawn)
+            return cls(**about, states=file["states"], motions=motions, images=loaded_images)
 
 
 @dataclass(frozen=True)
 class Scene:
     """A scene to demonstrate, and the folder of what comes of it.
 
-    cameras: those that are drawn. choices: at which frames, for each memory that will train on it.
+    cameras: those that render. choices: at which frames, for each memory that will train on it.
     carried_out, acts: see `record`.
     """
 
@@ -104,7 +144,7 @@ class Scene:
 
     @property
     def tried(self) -> bool:
-        """Whether there is nothing left to do: it failed, or is there with every frame that is to be drawn."""
+        """Whether there is nothing left to do: it failed, or is there with every required frame."""
         return self.failed.is_file() or (self.path.is_file() and self._complete())
 
     def _complete(self) -> bool:
@@ -136,9 +176,9 @@ def record(
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
-        choices: what the memories that will train on it read; these cameras are drawn at the frames of all of them.
-        carried_out: show what is seen while the demonstration's motions are carried out one by one, as a policy's are;
-            None too where that does not succeed. The demonstrator does more between some of its motions.
+        choices: what the memories that will train on it read; these cameras render the frames of all of them.
+        carried_out: render the frames while the demonstration's motions are carried out one by one, as a policy's are;
+            None too where that does not succeed. The demonstrator makes more steps between some of its motions.
         acts: of the robot that will learn from it. Where it chooses among options, the choices stand in place of
             motions, and the options behind the goal; None: motions.
     """
@@ -159,15 +199,19 @@ def record(
             motions = _carry_out(taken, motions.targets, chooser)
         if motions is None:
             return None
-        asked = [motions.decisions[:: choice.every] for choice in choices] or [motions.decisions]
-        at = {frame for frames in asked for frame in frames.tolist()}
-        read = at.union(*(choice.read(frames, taken.video) for choice, frames in zip(choices, asked, strict=False)))
-        wanted = {camera: read if camera == "front" else at for camera in cameras}
-        pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
-        for frame in sorted(set().union(*wanted.values())):
+        frame_lists = [motions.decisions[:: choice.every] for choice in choices] or [motions.decisions]
+        at = {frame for frames in frame_lists for frame in frames.tolist()}
+        read = at.union(
+            *(choice.read(frames, taken.video) for choice, frames in zip(choices, frame_lists, strict=False))
+        )
+        required = {camera: read if camera == "front" else at for camera in cameras}
+        images: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
+        for frame in sorted(set().union(*required.values())):
             taken.put_back(frame)
-            for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
-                pictures[camera][frame] = picture
+            rendered = [camera for camera in cameras if frame in required[camera]]
+            capture(env, rendered)
+            for camera in rendered:
+                images[camera][frame] = read_images(env, camera, rgb=True)["rgb"]
         goal = (
             env.goals()[0].lower()
             if chooser is None
@@ -176,7 +220,7 @@ def record(
         texts = [taken.texts[frame] for frame in motions.decisions]
         return Demonstration(
             type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
-            np.stack(taken.states), motions, pictures, {kind: _shown(texts, kind) for kind in SUBGOALS},
+            np.stack(taken.states), motions, images, {kind: _subgoal_texts(texts, kind) for kind in SUBGOALS},
         )  # fmt: skip
     finally:
         env.close()
@@ -207,13 +251,12 @@ class _Taken:
 
 def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
     """What a task offers to choose from."""
-    given = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
-    return read_options(given, len(chooser.choice))
+    options = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
+    return read_options(options, len(chooser.choice))
 
 
 def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     """The motions of a demonstration, or its choices, if it succeeds."""
-    from mme_vla.envs.drawing import Drawing
     from mme_vla.envs.recording.frames import choices_of, motions_of
     from mme_vla.envs.recording.recorder import Recorder
 
@@ -223,7 +266,7 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
         steps.append(step)
         taken.add(step.obs, step.info, step.info["is_video_demo"])
 
-    result = Recorder(taken.env, on_step=take, drawing=Drawing(now=())).record()
+    result = Recorder(taken.env, on_step=take, render_request=RenderRequest(now=())).record()
     if not result.success:
         return None
     return choices_of(steps) if choosing else motions_of(steps)
@@ -231,11 +274,10 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
 
 def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
     """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
-    from mme_vla.envs.drawing import Drawing
     from mme_vla.envs.interface import RoboMMEEnv
 
     env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
-    env.drawing = Drawing(now=())
+    env.render_request = RenderRequest(now=())
     env.on_frame = taken.add
     env.reset()
     decisions = []
@@ -248,23 +290,9 @@ def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None"
     return None
 
 
-def _shown(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
+def _subgoal_texts(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
     """The subgoal at each decision; where the simulator names none, the last one stays."""
-    found: list[str] = []
+    result: list[str] = []
     for text in texts:
-        found.append(online_subgoal(text, kind) or (found[-1] if found else ""))
-    return found
-
-
-def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:
-    """The current picture of each of these cameras."""
-    if not cameras:
-        return []
-    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    taken = []
-    for camera in cameras:
-        sensor = env.scene.sensors[CAMERAS[camera]]
-        sensor.capture()
-        images = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
-        taken.append((camera, np.ascontiguousarray(images["rgb"][0].cpu().numpy())))
-    return taken
+        result.append(online_subgoal(text, kind) or (result[-1] if result else ""))
+    return result

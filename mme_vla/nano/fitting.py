@@ -11,21 +11,20 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
-from mme_vla.files import read_json_lines, write_json
 from mme_vla.nano.demonstrations import Demonstration
-from mme_vla.nano.learning import Decisions, off_by, statistics
+from mme_vla.nano.learning import Decisions, position_error, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy, mme_of
-from mme_vla.processing.normalisers import NormStats
+from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
-from mme_vla.training.console import ProgressLine
-from mme_vla.training.logging import JsonLines, Loggers
+from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
-from mme_vla.training.validation import Validation
+from mme_vla.utils import read_lines, write_json
 
 DONE = "trained.json"
 HELD_OUT = 10
@@ -45,14 +44,11 @@ def compose_policy(
         model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
         words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
         extra_dirs: further trees, as `--config-dir` adds them. plugins: modules that the model needs beside its own.
-
-    Raises:
-        UserError: as `compose` and `import_plugins`.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
     memory = None if base.memory is None else str(base.memory.name)
-    chosen = [f"memory.{key}={value}" for key, value in memories.get(memory or "", {}).items()]
-    composed = compose("policy", [f"model={model}", *words, *chosen], extra_dirs=extra_dirs)
+    memory_words = [f"memory.{key}={value}" for key, value in memories.get(memory or "", {}).items()]
+    composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
     import_plugins(composed)
     config = OmegaConf.to_container(composed, resolve=True)
@@ -64,7 +60,7 @@ def build(config: Mapping[str, Any]) -> MMEPolicy:
     """A policy with fresh weights but for its tower, which does not learn."""
     policy = mme_of(build_from_config(OmegaConf.create(dict(config))), "nanoMME")
     if policy.augment:
-        raise UserError("policy.augment=true changes pictures, and nano policies learn from tokens: set it to false.")
+        raise UserError("policy.augment=true changes images, and nano policies learn from tokens: set it to false.")
     apply_finetuning(policy, freeze_vision=True)
     return policy
 
@@ -76,7 +72,7 @@ def train(
     files: Sequence[Path],
     learning: Mapping[str, Any],
 ) -> Path:
-    """Train a policy in `folder`, or go on with it; the last checkpoint.
+    """Train a policy in `folder`, or continue with it; the last checkpoint.
 
     Args:
         config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`.
@@ -87,19 +83,23 @@ def train(
     if (folder / DONE).is_file():
         return checkpoints_in(folder / "checkpoints")[-1]
     begun, cpu = time.perf_counter(), time.process_time()
-    chosen = TrainSettings.from_dict(settings, int(config["seed"]))
-    whole = {**config, "train": dict(settings), "learning": dict(learning)}
+    train_settings = TrainSettings.from_dict(settings, int(config["seed"]))
+    full_config = {**config, "train": dict(settings), "learning": dict(learning)}
     resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
     folder.mkdir(parents=True, exist_ok=True)
-    run, lock = claim_run(folder, True, resume, whole)
-    with ExitStack() as held_lock:
-        held_lock.push(lock)  # it is held already
+    run, lock = claim_run(folder, True, resume, full_config)
+    with ExitStack() as resources:
+        resources.push(lock)  # it is held already
         policy = build(config)
-        samples, held = prepared(policy, folder, files, learning)
+        samples, val_set = prepared(policy, folder, files, learning)
         policy.config["card"] = {"data": f"{len(files)} demonstrations", "recipe": dict(settings)}
-        validation = Validation(held, held.collate, chosen.val_samples, chosen.batch_size, chosen.seed)
-        trainer = Trainer(policy, samples, samples.collate, validation, chosen, run, whole, Accelerator(cpu=True))
-        line, loggers = ProgressLine(chosen.steps, run.step), Loggers([JsonLines(folder, run.step)])
+        validation = Validation(
+            val_set, val_set.collate, train_settings.val_samples, train_settings.batch_size, train_settings.seed
+        )
+        trainer = Trainer(
+            policy, samples, samples.collate, validation, train_settings, run, full_config, Accelerator(cpu=True)
+        )
+        line, loggers = ProgressLine(train_settings.steps, run.step), open_loggers(folder, {}, run.step)
         line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(files)} demonstrations")
         try:
             with line:
@@ -109,9 +109,11 @@ def train(
     assert trainer.last_checkpoint is not None
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
-    off = off_by(MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval(), held)
+    off = position_error(MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval(), val_set)
     spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
-    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), "off_by_m": off.tolist(), **spent})
+    write_json(
+        folder / DONE, {"steps": train_settings.steps, "decisions": len(samples), "off_by_m": off.tolist(), **spent}
+    )
     return trainer.last_checkpoint
 
 
@@ -119,30 +121,26 @@ def prepared(
     policy: MMEPolicy, folder: Path, files: Sequence[Path], learning: Mapping[str, Any]
 ) -> tuple[Decisions, Decisions]:
     """Decisions to learn from, and to measure by; their tokens, and the statistics, are made once for a folder."""
-    learnt_file, held_file, stats_file = (
+    learnt_file, val_file, stats_file = (
         folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
     )
+    options = {"oversample": learning["often"], "noise": learning["noise"], "token_noise": learning["blur"]}
     processor = policy.require_processor()
-    if held_file.is_file():  # written last
+    if val_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        size = {name: learning[name] for name in ("often", "noise", "blur")}
-        return Decisions.load(learnt_file, **size), Decisions.load(held_file)
+        return Decisions.load(learnt_file, **options), Decisions.load(val_file)
     learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
-    processor.stats = statistics((Demonstration.load(file, pictures=False) for file in learnt), policy)
+    processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
     processor.stats.save(stats_file)
-    samples, held = (
-        Decisions.of(policy, map(Demonstration.load, learnt), **learning),
-        Decisions.of(
-            policy,
-            map(Demonstration.load, files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]),
-            elsewhere=learning["elsewhere"],
-        ),
-    )
+    distance = learning["elsewhere"]
+    samples = Decisions.of(policy, map(Demonstration.load, learnt), min_distance=distance, **options)
+    held_out = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
+    val_set = Decisions.of(policy, map(Demonstration.load, held_out), min_distance=distance)
     samples.save(learnt_file)
-    held.save(held_file)
-    return samples, held
+    val_set.save(val_file)
+    return samples, val_set
 
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:
     """What the run logged, a dictionary a line."""
-    return [line for _, line in read_json_lines(folder / "metrics.jsonl", "the log of a run")]
+    return read_lines(folder / "metrics.jsonl", dict, "the log of a run")

@@ -1,4 +1,4 @@
-"""Training on demonstrations of planned motions: every decision is a sample, and all its tokens are made beforehand."""
+"""Training on demonstrations of planned motions: every decision is a sample, and its tokens are computed beforehand."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -11,23 +11,23 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.backbone.base import stack_draws
 from mme_vla.errors import UserError
-from mme_vla.files import write_atomically
-from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats
-from mme_vla.processing.subgoal_text import perturb_point, subgoal_kind
-from mme_vla.types import Batch, HistoryTokens
+from mme_vla.processing.base import motion_rows
+from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
+from mme_vla.processing.prompt import perturb_point, subgoal_kind
+from mme_vla.types import Batch, HistoryTokens, stack_noise
+from mme_vla.utils import write_atomically
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 
 
 _PAST = "history."
 JOINT_NOISE = 0.05
-ELSEWHERE = 0.05
+MIN_DISTANCE = 0.05
 """Metres above the table from where on a motion is one to another place."""
 
 
@@ -47,8 +47,8 @@ class SparseHistory(History):
     ) -> None:
         super().__init__(spec, exec_start)
         self._scores = FrameScores.empty(spec.grid**2) if scores is None else scores
-        self._length, self._kept = length, np.array(sorted(tokens), np.int64)
-        self._tokens = torch.stack([tokens[int(frame)] for frame in self._kept])
+        self._length, self._frames = length, np.array(sorted(tokens), np.int64)
+        self._tokens = torch.stack([tokens[int(frame)] for frame in self._frames])
 
     def __len__(self) -> int:
         return self._length
@@ -58,7 +58,7 @@ class SparseHistory(History):
         return self._scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        rows = self._row_of(indices[:, 0], self._kept)
+        rows = self._row_of(indices[:, 0], self._frames)
         return self._tokens[torch.as_tensor(rows), torch.as_tensor(indices[:, 1])]
 
 
@@ -66,64 +66,63 @@ class Decisions(Dataset[int]):
     """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
 
     batch: every decision, or every so many where the robot executes more motions of a chunk than one; the tokens of
-        the current pictures (`Batch.view_tokens`) stand in place of the pictures.
-    far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
-        an item `often` times.
+        the current images (`Batch.view_tokens`) stand in place of the images.
+    distant: [n] bool; decisions on a motion to another place than the last one's, which are hard and few: each is
+        an item `oversample` times.
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
         to each number of a token and, `JOINT_NOISE` of it, to each joint (radians).
-    blur: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
+    token_noise: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
     """
 
-    def __init__(self, batch: Batch, far: Tensor, often: int = 1, noise: float = 0.0, blur: float = 0.0) -> None:
-        self.batch, self.far, self.noise, self.blur = batch, far, noise, blur
-        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
+    def __init__(
+        self, batch: Batch, distant: Tensor, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0
+    ) -> None:
+        self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
+        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, oversample, 1))
 
     @classmethod
     def of(
         cls,
         policy: MMEPolicy,
         demonstrations: Iterable[Demonstration],
-        often: int = 1,
-        elsewhere: float = ELSEWHERE,
+        oversample: int = 1,
+        min_distance: float = MIN_DISTANCE,
         noise: float = 0.0,
-        blur: float = 0.0,
+        token_noise: float = 0.0,
     ) -> "Decisions":
-        """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
+        """Make all tokens, of one demonstration after the other: their images together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
-            often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
-                is elsewhere. noise, blur: see the class.
-
-        Raises:
-            UserError: there is no decision, or a frame that the memory remembers was not drawn.
+            min_distance: metres from which on a motion leads to another place. The others: see the class.
         """
         items: list[dict[str, Any]] = []
-        far: list[np.ndarray] = []
-        for found in demonstrations:
-            items += _items(policy, found)
-            far.append(_far(found.motions.targets, elsewhere)[:: policy.embodiment.action.execute])
+        distant: list[np.ndarray] = []
+        for demonstration in demonstrations:
+            items += _items(policy, demonstration)
+            distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often, noise, blur)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise)
 
     @classmethod
-    def load(cls, path: Path, often: int = 1, noise: float = 0.0, blur: float = 0.0) -> "Decisions":
+    def load(cls, path: Path, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
-        found = load_file(path)
-        far = found.pop("far")
-        past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
-        now: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often, noise, blur)
+        tensors = load_file(path)
+        distant = tensors.pop("far")
+        past = {name.removeprefix(_PAST): value for name, value in tensors.items() if name.startswith(_PAST)}
+        now: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith(_PAST)}
+        batch = Batch(**now, history=HistoryTokens(**past) if past else None)
+        return cls(batch, distant, oversample, noise, token_noise)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
         from safetensors.torch import save_file
 
         values = {name: value for name, value in vars(self.batch).items() if isinstance(value, Tensor)}
-        values["far"] = self.far
+        values["far"] = self.distant
         if self.batch.history is not None:
             past = vars(self.batch.history).items()
             values |= {f"{_PAST}{name}": value for name, value in past if isinstance(value, Tensor)}
@@ -138,64 +137,62 @@ class Decisions(Dataset[int]):
 
     def collate(self, rows: Sequence[int]) -> Batch:
         """The batch of these decisions."""
-        chosen = torch.as_tensor(list(rows))
-        batch = self.batch.rows(chosen)
-        return self._noisy(batch, rows) if self.noise or self.blur else batch
+        indices = torch.as_tensor(list(rows))
+        batch = self.batch.rows(indices)
+        return self._noisy(batch, rows) if self.noise or self.token_noise else batch
 
     def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
         generator = torch.Generator().manual_seed(hash(tuple(rows)))  # of numbers alone, so the same everywhere
 
-        def moved(values: Tensor, size: float | Tensor) -> Tensor:
+        def perturbed(values: Tensor, size: float | Tensor) -> Tensor:
             return (values + size * torch.randn(values.shape, generator=generator)).to(values.dtype)
 
         assert batch.state is not None and batch.view_tokens is not None
-        size = {name: self.noise + self.blur * spread for name, spread in self._spread.items()}
-        joints = moved(batch.state[:, :-1], JOINT_NOISE * self.noise)  # the last number is the gripper's, centimetres
+        size = {name: self.noise + self.token_noise * std for name, std in self._token_std.items()}
+        joints = perturbed(
+            batch.state[:, :-1], JOINT_NOISE * self.noise
+        )  # the last number is the gripper's, centimetres
         state = torch.cat([joints, batch.state[:, -1:]], 1)
-        batch = replace(batch, state=state, view_tokens=moved(batch.view_tokens, size["views"]))
+        batch = replace(batch, state=state, view_tokens=perturbed(batch.view_tokens, size["views"]))
         if batch.history is None:
             return batch
-        return replace(batch, history=replace(batch.history, features=moved(batch.history.features, size["past"])))
+        return replace(batch, history=replace(batch.history, features=perturbed(batch.history.features, size["past"])))
 
     @cached_property
-    def _spread(self) -> dict[str, Tensor]:
-        """The standard deviation of each number of a token, of the present pictures and of those remembered."""
-        found = {"views": self.batch.view_tokens, "past": None}
+    def _token_std(self) -> dict[str, Tensor]:
+        """The standard deviation of each number of a token, of the present images and of those remembered."""
+        features = {"views": self.batch.view_tokens, "past": None}
         if self.batch.history is not None:
-            found["past"] = self.batch.history.features[self.batch.history.mask]
-        return {name: t.float().flatten(0, -2).std(0) for name, t in found.items() if t is not None}
+            features["past"] = self.batch.history.features[self.batch.history.mask]
+        return {name: t.float().flatten(0, -2).std(0) for name, t in features.items() if t is not None}
 
 
-def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:
+def _distant(targets: np.ndarray, min_distance: float) -> np.ndarray:
     """Which of an episode's motions [m, 7] end that far above the table from the one before; the first does. [m]."""
     steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
-    return np.concatenate([[True], steps > elsewhere])
+    return np.concatenate([[True], steps > min_distance])
 
 
 @torch.no_grad()
-def off_by(policy: MMEPolicy, held: Decisions, seed: int = 0) -> Tensor:
+def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tensor:
     """How far above the table motions to another place end from where they should, the first of each chunk; [n] m."""
-    rows = held.far.nonzero()[:, 0].tolist()
-    batch, generator = held.collate(rows), torch.Generator().manual_seed(seed)
+    rows = val_set.distant.nonzero()[:, 0].tolist()
+    batch, generator = val_set.collate(rows), torch.Generator().manual_seed(seed)
     assert batch.actions is not None and batch.state is not None
-    chunk = policy.sample_actions(batch, stack_draws([policy.sample_draws(generator) for _ in rows])).float()
+    chunk = policy.sample_actions(batch, stack_noise([policy.sampling_noise(generator) for _ in rows])).float()
     processor = policy.require_processor()
-    said = processor.absolute_actions(chunk, batch.state)
-    return (said - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
+    predicted = processor.absolute_actions(chunk, batch.state)
+    return (predicted - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
 
 
 def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:
-    """What states and motions are normalised by; numbers that hardly move keep their size.
-
-    Raises:
-        UserError: fewer than two decisions.
-    """
+    """What states and motions are normalised by; numbers that hardly move keep their size."""
     states, actions = RunningStats(), RunningStats()
     space = policy.embodiment.action
-    for found in demonstrations:
-        state = torch.from_numpy(found.states[found.motions.decisions])
+    for demonstration in demonstrations:
+        state = torch.from_numpy(demonstration.states[demonstration.motions.decisions])
         states.update(state.numpy())
-        targets = torch.from_numpy(found.motions.targets)[:, None]
+        targets = torch.from_numpy(demonstration.motions.targets)[:, None]
         actions.update(space.to_relative(targets, state).numpy())
     return NormStats(state=states.result(), actions=_widened(actions.result()))
 
@@ -206,70 +203,74 @@ def _widened(stats: QuantileStats) -> QuantileStats:
 
 
 @torch.no_grad()
-def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
+def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, Any]]:
     processor, cameras = policy.require_processor(), policy.embodiment.camera_names
-    decisions = [int(frame) for frame in found.motions.decisions[:: policy.embodiment.action.execute]]
-    views = processor.images([np.stack([found.pictures[name][frame] for frame in decisions]) for name in cameras])
+    decisions = [int(frame) for frame in demonstration.motions.decisions[:: policy.embodiment.action.execute]]
+    views = processor.images([np.stack([demonstration.images[name][frame] for frame in decisions]) for name in cameras])
     flat = views.flatten(0, 1).float() / 255 * 2 - 1
     view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
-    history = _history(policy, found)
-    subgoals = _subgoals(policy, found)[:: policy.embodiment.action.execute]
+    history = _history(policy, demonstration)
+    subgoals = _subgoals(policy, demonstration)[:: policy.embodiment.action.execute]
     items = []
     for place, frame in enumerate(decisions):
-        state = found.states[frame]
-        chunk, recorded = found.motions.chunk(frame, processor.horizon)
-        prompt, prompt_mask = processor.prompt(found.goal, subgoal=subgoals[place], state=state)
+        state = demonstration.states[frame]
+        chunk, recorded = demonstration.motions.chunk(frame, processor.embodiment.action.horizon)
+        prompt, prompt_mask = processor.prompt(demonstration.goal, subgoal=subgoals[place], state=state)
         item = {
             "view_tokens": view_tokens[place], "prompt": prompt, "prompt_mask": prompt_mask,
             "state": torch.from_numpy(state), "actions": processor.actions(chunk, state),
             "action_mask": torch.from_numpy(recorded),
         }  # fmt: skip
         if history is not None:
-            item["history"] = policy.require_memory().recall(history, frame)
+            item["history"] = policy.require_memory().gather_selection(history, frame)
         items.append(item)
     return items
 
 
-def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
+def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
     if policy.memory is None:
         return None
-    drawn = found.pictures[policy.embodiment.memory_camera]
-    asked = found.motions.decisions[:: policy.embodiment.action.execute]
-    read = policy.frames_read(asked, found.exec_start).tolist()
-    taken = {frame: drawn[frame] for frame in read if frame in drawn} or drawn
+    images = demonstration.images[policy.embodiment.memory_camera]
+    decisions = demonstration.motions.decisions[:: policy.embodiment.action.execute]
+    read = policy.frames_read(decisions, demonstration.exec_start).tolist()
+    taken = {frame: images[frame] for frame in read if frame in images} or images
     tokens = policy.encode_frames(np.stack(list(taken.values())))
     history = SparseHistory(
-        policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start,
+        policy.memory.storage, demonstration.length, dict(zip(taken, tokens, strict=True)), demonstration.exec_start,
         _scores(policy.memory, taken),
     )  # fmt: skip
-    if policy.memory.reads_motion:  # an action is a motion of many frames here, so the states alone tell what was done
-        nothing = np.zeros((found.length, policy.embodiment.action.width), np.float32)
-        moved = policy.require_processor().motion(found.states[: found.length], nothing, np.zeros(found.length, bool))
-        history.motion = moved.__getitem__
+    if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
+        nothing = np.zeros((demonstration.length, policy.embodiment.action.width), np.float32)
+        motion = motion_rows(
+            policy.require_processor(),
+            demonstration.states[: demonstration.length],
+            nothing,
+            np.zeros(demonstration.length, bool),
+        )
+        history.motion = motion.__getitem__
     return history
 
 
-def _scores(memory: Memory, pictures: Mapping[int, np.ndarray]) -> FrameScores:
-    """What the memory's scorer says of these frames, as it says it while an episode runs."""
-    scorer = memory.make_scorer()
-    said = {} if scorer is None else {frame: scorer(frame, pictures[frame]) for frame in sorted(pictures)}
-    rows = {frame: values for frame, values in said.items() if values is not None}
+def _scores(memory: Memory, images: Mapping[int, np.ndarray]) -> FrameScores:
+    """The scores of these frames by the memory's scorer, as in an episode."""
+    scorer = make_scorer(memory)
+    scores = {} if scorer is None else {frame: scorer(frame, images[frame]) for frame in sorted(images)}
+    rows = {frame: values for frame, values in scores.items() if values is not None}
     if not rows:
         return FrameScores.empty(memory.storage.grid**2)
     return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
 
 
-def _subgoals(policy: MMEPolicy, found: Demonstration) -> Sequence[str | None]:
+def _subgoals(policy: MMEPolicy, demonstration: Demonstration) -> Sequence[str | None]:
     """The subgoal of each decision as the simulator says it, its point moved a little; None where none is read."""
     kind = subgoal_kind(policy)
     if kind is None:
-        return [None] * len(found.motions.decisions)
-    noise, rng = int(policy.config["subgoal_text"]["point_noise"]), np.random.default_rng(found.seed)
-    return [perturb_point(text, noise, rng) for text in found.subgoals[kind.removesuffix("_subgoal")]]
+        return [None] * len(demonstration.motions.decisions)
+    noise, rng = int(policy.config["subgoal_text"]["point_noise"]), np.random.default_rng(demonstration.seed)
+    return [perturb_point(text, noise, rng) for text in demonstration.subgoals[kind.removesuffix("_subgoal")]]
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:
-
     def stack(name: str) -> Tensor:
         return torch.stack([item[name] for item in items])
 

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
+from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, wilson
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
-from mme_vla.evaluation.results.intervals import wilson
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
-from mme_vla.files import read_json, write_atomically
+from mme_vla.nano.evaluating import NAME as PLANNER
 from mme_vla.nano.fitting import DONE, learning_curve
-from mme_vla.nano.planner import NAME as PLANNER
+from mme_vla.utils import read_json, write_atomically
+from mme_vla.utils.pages import render
 
 PAGE, CURVES = "page.md", "learning.png"
 LEVELS = ("easy", "medium", "hard")
@@ -26,43 +26,35 @@ def write_page(
     records: Mapping[str, Sequence[EpisodeRecord]],
     without: str | None,
     minutes: Mapping[str, Sequence[float]],
-    films: Sequence[Path],
+    videos: Sequence[Path],
 ) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
     Args:
         records: of each model, the one with memory first, and of the oracle planner. without: the one without memory,
-            which all others are compared with. minutes: of each stage, on the clock and of processors. films: one of a
+            which all others are compared with. minutes: of each stage, on the clock and of processors. videos: one of a
             success, one of a failure, as far as there are such.
     """
     trained = [model for model in records if model != PLANNER]
     results, comparisons = compared(records, config["task"], config["split"], without)
     plot_curves({model: learning_curve(folder / model) for model in trained}, folder / CURVES)
-    parts = [
-        f"# {config['task']} on two cores",
-        "",
-        f"{sum(config['demonstrations'].values())} demonstrations, {config['train']['steps']} updates, split "
-        f"`{config['split']}`; each episode once for each of the seeds {', '.join(map(str, config['policy_seeds']))} "
-        f"of the policy's noise. Brackets: `{PLANNER}` is the demonstrator, which knows where everything is, through "
-        f"the policies' actions; {f'`{without}` has no memory' if without else 'no policy without memory was run'}.",
-        "",
-        success_table(records, {model: read_json(folder / model / DONE, "a training's end") for model in trained}),
-        "",
-        *([to_markdown(comparison_table(comparisons))] if comparisons else []),
-        *[f"- {comparison.verdict}" for comparison in comparisons],
-        *[f"- {note}" for note in results.notes],
-        "",
-        "| stage | minutes | of the command's own process on a processor |",
-        "| --- | ---: | ---: |",
-        *[f"| {stage} | {wall:.1f} | {processors:.1f} |" for stage, (wall, processors) in minutes.items()],
-        "",
-        f"![Loss on held-out demonstrations]({CURVES})",
-        "",
-        *[f"- film: [{film.stem}](<{film.relative_to(folder)}>)" for film in films],
-        "",
-    ]
+    text = render(
+        "nano.md",
+        config=config,
+        demonstrations=sum(config["demonstrations"].values()),
+        seeds=", ".join(map(str, config["policy_seeds"])),
+        planner=PLANNER,
+        without=without,
+        success=success_table(records, {m: read_json(folder / m / DONE, "a training's end") for m in trained}),
+        comparison=to_markdown(comparison_table(comparisons)) if comparisons else "",
+        verdicts=[comparison.verdict for comparison in comparisons],
+        notes=results.notes,
+        minutes=minutes,
+        curves=CURVES,
+        videos=[(video.stem, video.relative_to(folder)) for video in videos],
+    )
     with write_atomically(folder / PAGE) as draft:
-        draft.write_text("\n".join(parts), encoding="utf-8")
+        draft.write_text(text, encoding="utf-8")
     return folder / PAGE
 
 
@@ -73,10 +65,12 @@ def compared(
 
     With none without memory: the first model against each other one.
     """
-    every = [record for own in records.values() for record in own]
+    every = [record for model_records in records.values() for record in model_records]
     protocol = Protocol((task,), 1 + max(record.episode for record in every))
     results = aggregate(every, protocol, split)
-    methods = {model: _method(results, own[0]) for model, own in records.items() if model != PLANNER}
+    methods = {
+        model: _method(results, model_records[0]) for model, model_records in records.items() if model != PLANNER
+    }
     fixed = next(iter(methods)) if without is None else without
     others = [method for model, method in methods.items() if model != fixed]
     pairs = [(methods[fixed], other) if without is None else (other, methods[fixed]) for other in others]
@@ -95,16 +89,16 @@ def success_table(records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[
     """
     columns = ("memory tokens", "all", "95 % interval", *LEVELS, "off by, held out", "within 2 cm")
     lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]
-    for model, own in records.items():
-        rate, episodes = _won(own) / len(own), len({record.episode for record in own})
+    for model, model_records in records.items():
+        rate, episodes = _won(model_records) / len(model_records), len({record.episode for record in model_records})
         interval = wilson(rate, episodes)
-        levels = [[record for record in own if record.difficulty == level] for level in LEVELS]
-        cells = [f"{_won(part)}/{len(part)}" if part else "" for part in (own, *levels)]
-        shown = f"{100 * rate:.0f} % ({cells[0]})"
-        spread = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
+        levels = [[record for record in model_records if record.difficulty == level] for level in LEVELS]
+        cells = [f"{_won(part)}/{len(part)}" if part else "" for part in (model_records, *levels)]
+        success = f"{100 * rate:.0f} % ({cells[0]})"
+        confidence = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
         off = np.array(ends[model]["off_by_m"]) if model in ends else None
-        held = ("", "") if off is None else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
-        row = (own[0].model, own[0].memory_budget or "", shown, spread, *cells[1:], *held)
+        errors = ("", "") if off is None else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
+        row = (model_records[0].model, model_records[0].memory_budget or "", success, confidence, *cells[1:], *errors)
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return "\n".join(lines)
 

@@ -1,6 +1,6 @@
-"""Pictures of the sixteen tasks with what is where in them: what the small vision tower learns to see from.
+"""Images of the sixteen tasks with what is where in them: what the small vision tower learns to see from.
 
-Nothing is simulated: a scene is built once, and for each picture its objects, the arm and the gripper are put somewhere
+Nothing is simulated: a scene is built once, and for each image its objects, the arm and the gripper are put somewhere
 else. Segmentation says which object every pixel shows, so labels cost nothing.
 """
 
@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.backbone.nano.tower import CLASSES
+from mme_vla.backbone.nano_vision import CLASSES
+from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.make import make_task
-from mme_vla.files import write_atomically
-from mme_vla.processing.pictures import resize_with_pad_uint8
+from mme_vla.envs.observations import capture, read_images
+from mme_vla.processing.images import resize_with_pad_uint8
+from mme_vla.utils import write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.envs.task import Task
@@ -22,20 +24,20 @@ _BY_NAME = {
     "board": "box", "box": "box", "obstacle": "obstacle", "peg": "peg",
 }  # fmt: skip
 LABEL_SIDE = 64
-"""Labels have a number for each of 64×64 places of a picture."""
+"""Labels have a number for each of 64×64 places of an image."""
 _CUBES = ("red cube", "green cube", "blue cube")
 _CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out where it has one
 
 
 def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures of one scene, differently arranged each time.
+    """Images of one scene, differently arranged each time.
 
     Args:
-        count: arrangements; each gives a picture of the front camera and one of the wrist's.
-        size: side of the pictures.
+        count: arrangements; each gives an image of the front camera and one of the wrist's.
+        size: side of the images.
 
     Returns:
-        pictures [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.
+        images [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.
     """
     from mme_vla.envs.robot.kinematics import Arm
 
@@ -44,13 +46,15 @@ def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> 
         env.reset()
         arm, rng = Arm(env.agent), np.random.default_rng(seed)
         owners = _owners(env)
-        pictures, labels = [], []
+        images, labels = [], []
         for _ in range(count):
             _arrange(env, arm, rng)
-            for picture, segments in _take(env):
-                pictures.append(resize_with_pad_uint8(picture, size))
-                labels.append(_label(picture, segments, owners))
-        return np.stack(pictures), np.stack(labels)
+            capture(env, CAMERAS)
+            for camera in CAMERAS:
+                taken = read_images(env, camera, rgb=True, segmentation=True)
+                images.append(resize_with_pad_uint8(taken["rgb"], size))
+                labels.append(_label(taken["rgb"], taken["segmentation"][..., 0], owners))
+        return np.stack(images), np.stack(labels)
     finally:
         env.close()
 
@@ -59,15 +63,14 @@ def record_scenes(folder: Path, task: str, seed: int, difficulty: str, count: in
     """Draw a scene into `folder`, unless it is there already; the path of its file."""
     path = folder / f"{task}-{difficulty}-{seed}.npz"
     if not path.is_file():
-        pictures, labels = draw_scene(task, seed, difficulty, count, size)
-        folder.mkdir(parents=True, exist_ok=True)
+        images, labels = draw_scene(task, seed, difficulty, count, size)
         with write_atomically(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, pictures=pictures, labels=labels)
+            np.savez_compressed(file, pictures=images, labels=labels)
     return path
 
 
 def _owners(env: "Task") -> dict[int, str]:
-    """Segmentation id → what the object is called, of everything that is not part of the room."""
+    """Segmentation id → what the object is called, of everything that is not background."""
     owners: dict[int, str] = {}
     for thing in env.things:
         for number in thing.segmentation_ids:
@@ -93,50 +96,38 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
             continue
         lifted = rng.uniform(0, 0.15) if rng.random() < 0.2 else 0.0
         place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), home.p[2] + lifted])
-        thing.move_to(sapien.Pose(place, (_turn(rng.uniform(-np.pi, np.pi)) * sapien.Pose(q=home.q)).q))
+        thing.move_to(sapien.Pose(place, (_yaw_pose(rng.uniform(-np.pi, np.pi)) * sapien.Pose(q=home.q)).q))
     if rng.random() < 0.2:
-        env.agent.robot.set_qpos(torch.as_tensor(_rest(env), dtype=torch.float32)[None])
+        env.agent.robot.set_qpos(torch.as_tensor(_home_qpos(env), dtype=torch.float32)[None])
         return
     near = [thing.position for thing in env.things if abs(thing.position[0]) < 0.5 and thing.position[2] > -0.05]
     place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), rng.uniform(0.03, 0.35)])
     if near and rng.random() < 0.6:
         place = near[rng.integers(len(near))] + [0, 0, rng.uniform(0.01, 0.2)]
     down = sapien.Pose(q=[0, 1, 0, 0])
-    joints = arm.ik(sapien.Pose(place) * _turn(rng.uniform(-0.8, 0.8)) * down, env.qpos)
+    joints = arm.ik(sapien.Pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * down, env.qpos)
     if joints is not None:
         fingers = [] if env.stick else [rng.uniform(0.0, 0.04)] * 2
         env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
 
 
-def _turn(yaw: float) -> Any:
+def _yaw_pose(yaw: float) -> Any:
     import sapien
 
     return sapien.Pose(q=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
 
 
-def _rest(env: "Task") -> np.ndarray:
+def _home_qpos(env: "Task") -> np.ndarray:
     return env.reset_action if env.stick else np.append(env.reset_action[:7], [0.04, 0.04])
 
 
-def _take(env: "Task") -> list[tuple[np.ndarray, np.ndarray]]:
-    """Picture [H, W, 3] and segmentation [H, W] of both cameras."""
-    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    taken = []
-    for camera in ("base_camera", "hand_camera"):
-        sensor = env.scene.sensors[camera]
-        sensor.capture()
-        images = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=True)
-        taken.append((images["rgb"][0].cpu().numpy(), images["segmentation"][0, ..., 0].cpu().numpy()))
-    return taken
-
-
-def _label(picture: np.ndarray, segments: np.ndarray, owners: dict[int, str]) -> np.ndarray:
+def _label(image: np.ndarray, segments: np.ndarray, owners: dict[int, str]) -> np.ndarray:
     label = np.zeros(segments.shape, np.uint8)
     for number in np.unique(segments):
         name = owners.get(int(number))
         if name is not None:
-            shown = segments == number
-            label[shown] = CLASSES.index(_class_of(name, picture[shown]))
+            mask = segments == number
+            label[mask] = CLASSES.index(_class_of(name, image[mask]))
     step = len(label) // LABEL_SIDE
     return label[step // 2 :: step, step // 2 :: step]
 

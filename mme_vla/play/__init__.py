@@ -1,13 +1,13 @@
-"""The tasks as questions with a few answers: clips are shown, the next action is chosen, an oracle planner does it.
+"""The tasks as multiple choice: clips are shown, the next action is chosen, an oracle planner carries it out.
 
-Names are imported when they are used, so that `python -m mme_vla.play` can be stopped from its first moment on.
+Names are imported when they are used, so that `python -m mme_vla.play` can be interrupted at once.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mme_vla.embodiment.options import Option
+    from mme_vla.embodiment.action_space import Option
     from mme_vla.play.game import ChoiceSession, Decision, EpisodeId, Reveal
     from mme_vla.play.players import PLAYERS, NoChoiceError, OraclePlayer, Player, RandomPlayer, build_player
     from mme_vla.play.vlm_players import GeminiPlayer, OpenAIPlayer, QwenPlayer
@@ -19,7 +19,7 @@ __all__ = [
 
 _PLAYERS = ("PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player")
 _HOMES = {
-    "Option": "mme_vla.embodiment.options",
+    "Option": "mme_vla.embodiment.action_space",
     **dict.fromkeys(("ChoiceSession", "Decision", "EpisodeId", "Reveal"), "mme_vla.play.game"),
     **dict.fromkeys(("GeminiPlayer", "OpenAIPlayer", "QwenPlayer"), "mme_vla.play.vlm_players"),
     **dict.fromkeys(_PLAYERS, "mme_vla.play.players"),

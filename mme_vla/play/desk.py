@@ -67,8 +67,8 @@ class Desk:
             StaleError: the question is no longer asked. UserError: the choice cannot be made; nothing has happened.
         """
         session = self.session
-        asked = (request.get("session"), request.get("decision"))
-        if self.phase != "choosing" or session is None or asked != (self.session_id, len(session.decisions)):
+        requested = (request.get("session"), request.get("decision"))
+        if self.phase != "choosing" or session is None or requested != (self.session_id, len(session.decisions)):
             raise StaleError("This was decided already; the page shows the present question.")
         session.check(request)
         action = {"choice": request["choice"], "point": request.get("point")}
@@ -86,10 +86,10 @@ class Desk:
         """All but the frames, as JSON takes it."""
         # The simulator's thread changes these meanwhile: each is read once.
         run, phase, session, session_id, todo = self.run, self.phase, self.session, self.session_id, list(self.run.todo)
-        done = len(run.wanted) - len(todo)
+        done = len(run.episodes) - len(todo)
         state: dict[str, Any] = {
             "phase": phase, "error": self.error, "for_s": round(time.monotonic() - self._since, 1),
-            "total": len(run.wanted), "played": done, "successes": sum(record.success for record in run.records),
+            "total": len(run.episodes), "played": done, "successes": sum(record.success for record in run.records),
             "participant": self.participant, "session": session_id,
         }  # fmt: skip
         if phase == "finished":
@@ -184,9 +184,9 @@ def pack_frames(frames: Sequence[np.ndarray]) -> bytes:
     """Frames as JPEGs behind a table: their number and each one's size in bytes, all uint32 in little-endian order."""
     from PIL import Image
 
-    pictures = []
+    images = []
     for frame in frames:
         buffer = io.BytesIO()
         Image.fromarray(np.asarray(frame)).save(buffer, "JPEG", quality=QUALITY, subsampling=0)
-        pictures.append(buffer.getvalue())
-    return struct.pack(f"<{len(pictures) + 1}I", len(pictures), *map(len, pictures)) + b"".join(pictures)
+        images.append(buffer.getvalue())
+    return struct.pack(f"<{len(images) + 1}I", len(images), *map(len, images)) + b"".join(images)

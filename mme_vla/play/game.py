@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment.options import Option
+from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
 ONGOING = "ongoing"
 UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)
-"""Stands for the frames of an environment that does not render."""
+"""Frame of an environment that does not render."""
 MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
 
 
@@ -36,7 +36,7 @@ class EpisodeId:
 
 @dataclass(frozen=True)
 class Reveal:
-    """The frames that came to light at once.
+    """Frames that are shown together.
 
     title: what they show. frames: [256, 256, 3] uint8 each, maybe none. start: place of the first in the episode.
     """
@@ -50,9 +50,9 @@ class Reveal:
 class Decision:
     """One choice and what came of it.
 
-    choice: letter. action: its text. point: pixel [y, x] of the front picture, None where it needs none.
+    choice: letter. action: its text. point: pixel [y, x] of the front image, None where it needs none.
     frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
-    seconds: from the moment the frames were there to the choice. note: whatever the player adds.
+    seconds: from the arrival of the frames to the choice. note: the player's addition.
     """
 
     choice: str
@@ -70,7 +70,7 @@ class ChoiceSession:
     Args:
         env: with `reset` and `step` of `mme_vla.envs` (or the official package's), in that action space.
         episode: which one it is.
-        pictures: whether the player looks at them; without, the environment need not render, and frames are black.
+        images: whether the player reads them; without, the environment need not render, and frames are black.
         max_choices: choices after which the episode counts as timed out; a choice may move nothing at all, so the
             environment's own limit on steps might never be reached.
         clock: seconds that only grow.
@@ -88,30 +88,26 @@ class ChoiceSession:
         env: Any,
         episode: EpisodeId,
         max_choices: int = MAX_CHOICES,
-        pictures: bool = True,
+        images: bool = True,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         if isinstance(max_choices, bool) or not isinstance(max_choices, int) or max_choices < 1:
             raise UserError(f"max_choices is {max_choices!r}; expected a positive integer.")
-        self.env, self.episode, self.max_choices, self.pictures = env, episode, max_choices, pictures
+        self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
         self.goal, self.status, self.error = "", "not started", ""
         self.ended_by = ""
         """What ended the episode where it was not the environment: `max_choices`, or a player's reason."""
         self.options: tuple[Option, ...] = ()
         self.reveals: list[Reveal] = []
         self.decisions: list[Decision] = []
-        self._clock, self._shown_at = clock, 0.0
+        self._clock, self._displayed_at = clock, 0.0
         self._begun = clock()
-        self._simulated = self._thought = 0.0
+        self._simulated = self._policy_seconds = 0.0
 
     # Playing ------------------------------------------------------------------------------------------------------
 
     def start(self) -> Reveal:
-        """Reset the environment, which shows the conditioning video, if any, and then the present frame.
-
-        Raises:
-            UserError: it was started before, or the environment shows no pictures or no options.
-        """
+        """Reset the environment, which shows the conditioning video, if any, and then the present frame."""
         if self.reveals:
             raise UserError("This session has begun; make a new one for another episode.")
         started = self._clock()
@@ -119,7 +115,7 @@ class ChoiceSession:
         self._simulated += self._clock() - started
         frames = self._frames(observation)
         if not frames:
-            raise UserError("The environment shows no pictures: make it with render=True.")
+            raise UserError("The environment shows no images: make it with render=True.")
         if "available_multi_choices" not in info:
             raise UserError('The environment offers no options: make it with action_space="multi_choice".')
         title = "Conditioning video" if len(frames) > 1 else "The scene"
@@ -135,35 +131,27 @@ class ChoiceSession:
 
         Returns:
             The frames of the motion; none where nothing moved, or the environment could not do it.
-
-        Raises:
-            UserError: the episode is not under way, no such option, or a point is missing or outside of the picture.
-                Nothing has happened then, and another choice can be made.
         """
         option, point = self.check(action)
-        self._thought += (thought := self._clock() - self._shown_at)
+        self._policy_seconds += (seconds := self._clock() - self._displayed_at)
         started = self._clock()
-        wanted = {"choice": option.label, "point": [] if point is None else list(point)}
-        observation, _, _, _, info = self.env.step(wanted)
+        env_action = {"choice": option.label, "point": [] if point is None else list(point)}
+        observation, _, _, _, info = self.env.step(env_action)
         self._simulated += self._clock() - started
         frames = self._frames(observation or {})
-        first = self.frames_shown
+        first = self.n_displayed_frames
         self.error = str(info.get("error_message", ""))
         self._take(frames, info, option.action)
         span = (first, first + len(frames))
         self.decisions.append(
-            Decision(option.label, option.action, point, span, self.status, round(thought, 3), dict(note or {}))
+            Decision(option.label, option.action, point, span, self.status, round(seconds, 3), dict(note or {}))
         )
         if not self.over and len(self.decisions) >= self.max_choices:
             self.give_up("timeout", "max_choices")
         return self.reveals[-1]
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
-        """The option and point that an action means.
-
-        Raises:
-            UserError: as `choose`.
-        """
+        """The option and point that an action means."""
         if self.status != ONGOING:
             raise UserError(f"No choice can be made: the episode is over ({self.status})." if self.reveals
                             else "No choice can be made before start().")  # fmt: skip
@@ -181,9 +169,6 @@ class ChoiceSession:
 
         Args:
             outcome: what it counts as. reason: why, kept in the record.
-
-        Raises:
-            UserError: no such outcome, or the episode is over.
         """
         if outcome not in OUTCOMES:
             raise UserError(f"Unknown outcome {outcome!r}. {did_you_mean(outcome, OUTCOMES)}")
@@ -201,19 +186,15 @@ class ChoiceSession:
         return self.status in OUTCOMES
 
     @property
-    def frames_shown(self) -> int:
+    def n_displayed_frames(self) -> int:
         """Frames revealed so far."""
         return sum(len(reveal.frames) for reveal in self.reveals)
 
     @property
     def frame(self) -> np.ndarray:
-        """The present front picture [256, 256, 3]: points are pixels of it.
-
-        Raises:
-            UserError: the session was not started.
-        """
+        """The present front image [256, 256, 3]: points are pixels of it."""
         if not self.reveals:
-            raise UserError("There is no picture before start().")
+            raise UserError("There is no image before start().")
         return next(reveal.frames[-1] for reveal in reversed(self.reveals) if len(reveal.frames))
 
     @property
@@ -224,11 +205,7 @@ class ChoiceSession:
     def record(
         self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
     ) -> EpisodeRecord:
-        """The episode as evaluation keeps it, its decisions in `extra`.
-
-        Raises:
-            UserError: it is not over.
-        """
+        """The episode as evaluation keeps it, its decisions in `extra`."""
         if not self.over:
             raise UserError(f"The episode is not over ({self.status}); there is nothing to record yet.")
         which = self.episode
@@ -237,8 +214,8 @@ class ChoiceSession:
             model=model, checkpoint=checkpoint, model_seed=model_seed, max_steps=max_steps, action_space="multi_choice",
             task=which.task, episode=which.episode, seed=which.seed, difficulty=which.difficulty, split=which.split,
             outcome=self.status, steps=self.steps, error=self.error or None,
-            seconds=Seconds(round(self._simulated, 3), round(self._thought, 3), round(self._clock() - self._begun, 3)),
-            extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},
+            seconds=Seconds(round(self._simulated, 3), round(self._policy_seconds, 3), round(self._clock() -
+            self._begun, 3)), extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},
         )  # fmt: skip
 
     def close(self) -> None:
@@ -246,12 +223,12 @@ class ChoiceSession:
         self.env.close()
 
     def _frames(self, observation: Mapping[str, Any]) -> list[np.ndarray]:
-        if self.pictures:
+        if self.images:
             return list(observation.get("front_rgb_list", ()))
         return [UNSEEN] * max((len(values) for values in observation.values()), default=0)
 
     def _take(self, frames: list[np.ndarray], info: Mapping[str, Any], title: str) -> None:
-        self.reveals.append(Reveal(title, frames, self.frames_shown))
+        self.reveals.append(Reveal(title, frames, self.n_displayed_frames))
         self.status = str(info["status"])
         if info.get("task_goal"):
             goal = info["task_goal"]
@@ -261,15 +238,11 @@ class ChoiceSession:
                 Option(str(option["label"]).lower(), str(option["action"]), bool(option["need_parameter"]))
                 for option in info["available_multi_choices"]
             )
-        self._shown_at = self._clock()
+        self._displayed_at = self._clock()
 
 
 def checked_point(point: Any, option: Option) -> tuple[float, float]:
-    """A pixel (row, column) of the front picture.
-
-    Raises:
-        UserError: it is missing, malformed or outside.
-    """
+    """A pixel (row, column) of the front image."""
     what = f"Option {option.label!r} ({option.action})"
     if point is None or (isinstance(point, Sequence) and not len(point)):
         raise UserError(f"{what} needs a point: the pixel [row, column] of the object meant.")
@@ -282,6 +255,6 @@ def checked_point(point: Any, option: Option) -> tuple[float, float]:
     y, x = (float(value) for value in values)
     if not (0 <= y < SIDE and 0 <= x < SIDE):
         raise UserError(
-            f"The point ({y:g}, {x:g}) lies outside of the picture: rows and columns go from 0 to {SIDE - 1}."
+            f"The point ({y:g}, {x:g}) lies outside of the image: rows and columns go from 0 to {SIDE - 1}."
         )
     return y, x

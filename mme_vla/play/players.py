@@ -13,7 +13,7 @@ from mme_vla.registry import PLAYERS
 
 
 class NoChoiceError(Exception):
-    """A player does not go on. outcome: what the episode counts as; the message says why."""
+    """A player does not continue. outcome: what the episode counts as; the message says why."""
 
     def __init__(self, outcome: str, reason: str) -> None:
         super().__init__(reason)
@@ -25,11 +25,11 @@ class Player:
 
     Attributes:
         model: what its records are filed under.
-        looks: whether it needs pictures; for one that does not, nothing is rendered, which is much faster.
+        needs_images: whether it reads images; for one that does not, nothing is rendered, which is much faster.
     """
 
     model = "player"
-    looks = True
+    needs_images = True
 
     def start(self, session: ChoiceSession) -> None:
         """Take note of a new episode, which has been started."""
@@ -38,7 +38,7 @@ class Player:
         """The next action {"choice", "point"} and a note to keep with it.
 
         Raises:
-            NoChoiceError: the player does not go on.
+            NoChoiceError: the player does not continue.
         """
         raise NotImplementedError
 
@@ -73,7 +73,7 @@ class RandomPlayer(Player):
     """
 
     model = "random"
-    looks = False
+    needs_images = False
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed
@@ -99,14 +99,10 @@ class OraclePlayer(Player):
     """
 
     model = "oracle"
-    looks = False
+    needs_images = False
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See `Player`.
-
-        Raises:
-            UserError: the environment is not of this library, so that its script is not known.
-        """
+        """See `Player`."""
         from mme_vla.envs.grounding import project
 
         task = getattr(session.env, "task", None)
@@ -138,10 +134,6 @@ def _stuck(reason: str) -> NoReturn:
 
 
 def build_player(config: Mapping[str, Any]) -> Player:
-    """Build from the section `player` of a configuration.
-
-    Raises:
-        UserError: an unknown player or option.
-    """
+    """Build from the section `player` of a configuration."""
     player: Player = PLAYERS.build(config)
     return player

@@ -7,33 +7,27 @@ from types import TracebackType
 from typing import Any, Self
 
 from mme_vla.envs.episodes import choose_episodes as choose_specs
-from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.results.paper import paper_table
-from mme_vla.evaluation.run_file import claim_run
-from mme_vla.evaluation.suites import PAPER_ORDER
+from mme_vla.evaluation.results.scopes import PAPER_ORDER
+from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.play.game import ChoiceSession, EpisodeId
 
 
-def make_session(
-    episode: EpisodeId, env: str, max_steps: int, max_choices: int, pictures: bool = True
-) -> ChoiceSession:
+def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int, images: bool = True) -> ChoiceSession:
     """The simulator for one episode.
 
     Args:
         episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out.
-        pictures: whether the player looks at them; the official environment renders in any case.
-
-    Raises:
-        UserError: as `make_env`.
+        images: whether the player reads them; the official environment renders in any case.
     """
     from mme_vla.envs import make_env
 
-    render = pictures or env == "official"
+    render = images or env == "official"
     which = (episode.task, episode.split, episode.episode)
     made = make_env(*which, "multi_choice", max_steps=max_steps, env=env, render=render)
     try:
-        return ChoiceSession(made, episode, max_choices, pictures)
+        return ChoiceSession(made, episode, max_choices, images)
     except BaseException:
         made.close()
         raise
@@ -55,18 +49,15 @@ class PlayRun:
 
     Args:
         folder: of `episodes.jsonl` and `run.json`.
-        wanted: episodes to play, in order. identity: whose.
+        episodes: to play, in order. identity: of the records.
         make: makes the session of an episode.
         retry_errors: play episodes again that ended in an error.
-
-    Raises:
-        UserError: the folder holds a run with other settings, or another process writes to it.
     """
 
     def __init__(
         self,
         folder: Path,
-        wanted: Sequence[EpisodeId],
+        episodes: Sequence[EpisodeId],
         identity: Identity,
         make: Callable[[EpisodeId], ChoiceSession],
         retry_errors: bool = False,
@@ -74,19 +65,20 @@ class PlayRun:
         self.folder, self.identity, self.make = folder, identity, make
         claim_run(folder, identity.settings)
         self._log = RecordLog(folder / RECORDS)
-        self.wanted = list(wanted)
-        keys = {(which.task, which.episode) for which in self.wanted}
+        self.episodes = list(episodes)
+        keys = {(which.task, which.episode) for which in self.episodes}
         # Folders below hold runs of their own.
         there = [record for path in sorted(folder.glob("episodes*.jsonl")) for record in read_records(path)]
         self.records = [record for record in merge(there, "last") if (record.task, record.episode) in keys]
         done = finished(self.records, retry_errors)
-        self.todo = [which for which in self.wanted if (which.task, which.episode) not in done]
+        self.todo = [which for which in self.episodes if (which.task, which.episode) not in done]
 
     def save(self, session: ChoiceSession, **extra: Any) -> EpisodeRecord:
         """Write the record of a session that is over."""
-        own = self.identity
+        identity = self.identity
         return self._keep(
-            session.episode, session.record(own.model, own.checkpoint, own.model_seed, own.max_steps, **extra)
+            session.episode,
+            session.record(identity.model, identity.checkpoint, identity.model_seed, identity.max_steps, **extra),
         )
 
     def save_error(
@@ -103,11 +95,11 @@ class PlayRun:
             if not session.over:
                 session.give_up("error", reason)
             return self.save(session, **extra)
-        own = self.identity
+        identity = self.identity
         record = EpisodeRecord(
-            model=own.model, checkpoint=own.checkpoint, model_seed=own.model_seed, max_steps=own.max_steps,
-            action_space="multi_choice", task=which.task, episode=which.episode, seed=which.seed,
-            difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
+            model=identity.model, checkpoint=identity.checkpoint, model_seed=identity.model_seed,
+            max_steps=identity.max_steps, action_space="multi_choice", task=which.task, episode=which.episode,
+            seed=which.seed, difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
             extra={"decisions": [], "ended_by": reason, **extra},
         )  # fmt: skip
         return self._keep(which, record)
@@ -141,10 +133,6 @@ class PlayRun:
 
 
 def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str) -> list[EpisodeId]:
-    """The episodes that the command line names, task by task, by the grammar of all commands (`mme_vla.envs.episodes`).
-
-    Raises:
-        UserError: an unknown task or split, or episodes that the split has not.
-    """
+    """The episodes that the command line names, by the grammar of `mme_vla.envs.episodes`."""
     specs = choose_specs(tasks, episodes, split)
     return [EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty) for spec in specs]

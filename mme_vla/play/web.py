@@ -9,12 +9,12 @@ from importlib.util import find_spec
 from typing import Any
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.files import parse_json
 from mme_vla.play.desk import Desk, StaleError
-from mme_vla.serving.listen import is_local, listen
+from mme_vla.serving.settings import is_local, listen
+from mme_vla.utils import parse_json
 
 log = logging.getLogger("mme_vla.play")
-PAGE = {"": "index.html", "play.css": "play.css", "play.js": "play.js", "film.js": "film.js", "icon.svg": "icon.svg"}
+PAGE = {"": "index.html"} | {name: name for name in ("play.css", "play.js", "player.js", "icon.svg")}
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 MOST = 4096  # bytes of a request's body
 ARRIVAL_S = 10  # seconds that headers may take, and a body
@@ -28,11 +28,7 @@ HEADERS = (
 
 
 def require_page() -> None:
-    """Refuse to go on without the packages the page needs.
-
-    Raises:
-        UserError: the extra `play` is not installed.
-    """
+    """Refuse to continue without the packages the page needs."""
     if find_spec("starlette") is None or find_spec("uvicorn") is None:
         raise missing_extra("The page", "play")
 
@@ -41,11 +37,8 @@ def make_app(desk: Desk, local: bool = True) -> Any:
     """The ASGI application; the desk begins when it starts.
 
     Args:
-        local: answer only requests that name this machine as their host, so that no foreign page a browser has open can
+        local: accept only requests that name this machine as their host, so that no foreign page a browser has open can
             reach the desk under a name of its own.
-
-    Raises:
-        UserError: the extra `play` is not installed.
     """
     require_page()
     from starlette.applications import Starlette
@@ -67,15 +60,15 @@ def make_app(desk: Desk, local: bool = True) -> Any:
         return JSONResponse(desk.state())
 
     async def frames(request: Request) -> Response:
-        wanted = request.path_params
+        path_params = request.path_params
         try:
-            packed = await asyncio.to_thread(desk.frames, wanted["session"], wanted["number"])
+            packed = await asyncio.to_thread(desk.frames, path_params["session"], path_params["number"])
         except StaleError as error:
             return refuse(404, str(error))
         return Response(packed, media_type="application/octet-stream")
 
     async def body(request: Request) -> Any:
-        # A foreign page cannot send this kind without being asked first, and it is not answered then.
+        # A foreign page cannot send this type without a preflight request, which fails.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise UserError("Send JSON, as application/json.")
         content = bytearray()
@@ -139,16 +132,20 @@ def _guarded(app: Any, local: bool) -> Any:
             unread = unread and bool(message.get("more_body", False))
             return message
 
-        async def sealed(message: Any) -> None:
+        async def send_with_headers(message: Any) -> None:
             if message["type"] == "http.response.start":
                 close = [(b"connection", b"close")] if unread else []
                 message = {**message, "headers": [*message["headers"], *HEADERS, *close]}
             await send(message)
 
         if local and not is_local(_host_of(scope)):
-            await sealed({"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]})
-            return await sealed({"type": "http.response.body", "body": b"This page is for this machine only.\n"})
-        return await app(scope, reading, sealed)
+            await send_with_headers(
+                {"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]}
+            )
+            return await send_with_headers(
+                {"type": "http.response.body", "body": b"This page is for this machine only.\n"}
+            )
+        return await app(scope, reading, send_with_headers)
 
     return guarded
 
@@ -161,11 +158,7 @@ def _host_of(scope: Any) -> str:
 
 
 def make_server(desk: Desk, local: bool = True) -> Any:
-    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or `should_exit`.
-
-    Raises:
-        UserError: the extra `play` is not installed.
-    """
+    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or `should_exit`."""
     app = make_app(desk, local)
     import uvicorn
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -196,17 +189,13 @@ def make_server(desk: Desk, local: bool = True) -> Any:
 
 
 def serve(desk: Desk, host: str, port: int) -> None:
-    """Serve the page until Ctrl-C.
-
-    Raises:
-        UserError: as `listen` and `make_server`.
-    """
+    """Serve the page until Ctrl-C."""
     server = make_server(desk, is_local(host))
     with listen(host, port) as bound:
-        shown = f"[{host}]" if ":" in host else host
+        display_host = f"[{host}]" if ":" in host else host
         if not is_local(host):
-            log.warning("host=%s: whoever reaches this port can play", host)
-        desk.address = f"http://{shown}:{bound.getsockname()[1]}"
+            log.warning("host=%s: every client that reaches this port can play", host)
+        desk.address = f"http://{display_host}:{bound.getsockname()[1]}"
         log.info("open %s in a browser; Ctrl-C ends", desk.address)
         with suppress(KeyboardInterrupt):  # uvicorn raises it again when all is closed
             server.run(sockets=[bound])

@@ -1,56 +1,44 @@
-"""`Policy`: what training, evaluation, serving and weights speak to, whatever is inside."""
+"""`Policy`: the interface that training, evaluation, serving and weights use. Capabilities are in `capabilities.py`."""
 
-import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from mme_vla.backbone.base import Draws, stack_draws
-from mme_vla.backbone.layers.recomputing import Recompute
-from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import Memory
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule
+from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.saving import Saved
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
+from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
 
 
-class Policy(Saved):
-    """A policy: a loss to train, chunks to sample, episodes to act in, parts to freeze or adapt, a folder to live in.
+class Policy(nn.Module):
+    """A policy: a loss to train, chunks to sample, episodes to act in, parameters to fine-tune, a folder to save to.
 
-    A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
-    `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
-    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so
-    that training resumes bit for bit, and the noise of an episode does not depend on its batch; only the policy knows
-    what they mean.
+    A subclass registers in `POLICIES` (`policy.name` of a configuration), sets the attributes below, and implements
+    what raises NotImplementedError. Its processor defines the batches. Random numbers are passed in
+    (`training_noise`, `sampling_noise`), so that training resumes bit for bit, and the noise of an episode does not
+    depend on its batch.
     """
 
-    memory: Memory | None
+    memory: MemoryModule | None
     processor: "PolicyProcessor | None"
     config: dict[str, Any]
+    """What `from_config` was given; saved with the weights."""
     compute_dtype: torch.dtype = torch.float32
     """Matrix products run in it, under autocast."""
-    history_dtype: torch.dtype = torch.bfloat16
-    """Of stored vision tokens."""
     horizon: int
-    """Steps of a chunk."""
-    skipped: int = 0
-    """Steps at a chunk's beginning that lie in the past and are never executed."""
-    sessions_before: int = 0
-    """Unrelated episodes that it is shown before each of its own, as a stress split asks for them."""
-    sample_steps: int = 1
-    """Steps of its sampler unless told otherwise."""
-    agrees: bool = False
-    """Whether its chunks can agree with actions that are already promised (`Episode.promise`)."""
-    most_actions: int | None = None
-    """Actions after which a rollout ends an episode as timed out, beside its limit of frames; None: that one alone."""
+    """Steps of a chunk. The first `processor.samples.window - 1` lie in the past and are not executed."""
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
 
@@ -60,209 +48,187 @@ class Policy(Saved):
 
     @property
     def embodiment(self) -> Embodiment:
-        """The robot this policy is for: its processor's, else its configuration's."""
+        """The robot of the processor, else of the configuration."""
         return embodiment_of(self.config) if self.processor is None else self.processor.embodiment
 
-    # Training
-
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
-        return {}
-
-    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """The random numbers that change the pictures of `count` training samples, if any; beside `loss_draws`'s."""
-        return {}
-
-    def forward(self, batch: Any, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss of a batch, and metrics to log (detached).
-
-        Args:
-            batch: with `actions`. draws: as `loss_draws` makes them, on the policy's device; fresh ones by default.
-        """
-        raise NotImplementedError
-
-    def recompute(self, wanted: Recompute) -> None:
-        """Compute activations again in the backward pass instead of keeping them (all, or `selective`), or not."""
-        raise NotImplementedError
-
-    def shard_groups(self) -> Sequence[ShardGroup]:
-        """What processes that share the weights gather together; all else is gathered for a whole pass, in float32."""
-        return [ShardGroup(layer) for layer in stacked_layers(self)]
-
-    # Sampling
-
-    def sample_draws(self, generator: torch.Generator) -> Draws:
-        """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
-        return {}
-
-    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
-        """A normalised chunk [b, h, a].
-
-        Args:
-            draws: as `sample_draws` makes them, with a batch axis, on the policy's device; fresh ones by default.
-            steps: of an iterative head; its own number by default.
-        """
-        raise NotImplementedError
-
-    def compile_sampling(self, layers: bool = False) -> None:
-        """Make chunks quick, for a policy whose weights are done; see `MMEPolicy.compile_sampling`.
-
-        Raises:
-            UserError: this policy's sampler cannot be compiled.
-        """
-        raise UserError(f"{type(self).__name__} has no sampler that can be compiled: leave sampling=eager.")
-
     @property
-    def compiles_sampling(self) -> bool:
-        """Whether `compile_sampling` is for this policy."""
-        return False
-
-    # Episodes
-
-    def start_episode(self, goal: str, seed: int = 0) -> Episode:
-        """Begin an episode: its memory, its noise and its current view live in the returned object alone."""
-        return Episode(self, goal, seed)
-
-    def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
-        """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
-
-        Returns:
-            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them; without the first
-            `skipped` of a chunk.
-        """
-        if isinstance(episodes, Episode):
-            alone: np.ndarray = self.act([episodes], steps)[0]
-            return alone
-        if not episodes:
-            return np.zeros((0, self.horizon - self.skipped, self.embodiment.action.width), np.float32)
-        processor = self.require_processor()
-        if not self.agrees and any(e.promised is not None for e in episodes):
-            name = self.config.get("name", type(self).__name__)
-            raise UserError(
-                f"{name} answers without regard to what was promised: real-time chunking needs a policy whose actions "
-                "are a flow, such as π0.5's. Leave out promise()."
-            )
-        processor.require_stats()  # before any episode's noise or memory moves on
-        batch = self.observation(episodes)
-        draws = stack_draws([e.draw() for e in episodes])
-        was_training = self.training
-        self.eval()
-        try:
-            chunk = self.answer(batch, episodes, draws, steps).float().cpu()
-        finally:
-            self.train(was_training)
-        states, space = torch.stack([e.state for e in episodes]), self.embodiment.action
-        absolute = processor.absolute_actions(chunk, states)
-        decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
-        actions = torch.stack(decided).numpy()[:, self.skipped :]
-        for episode, chosen in zip(episodes, actions, strict=True):
-            episode.acted(chosen)
-        return actions
-
-    def prepare(self, episode: Episode) -> bool:
-        """Do a piece of what an episode's next chunk will need, in time in which nobody waits; no action changes.
-
-        Server and rollouts call it while robots move: a recurrent memory whose list of frames is full would otherwise
-        take all of them anew when the next chunk is asked for.
-
-        Returns:
-            Whether a piece is left.
-        """
-        return False
-
-    def observation(self, episodes: Sequence[Episode]) -> Any:
-        """What running episodes see now, as a batch of the processor's kind on the policy's device."""
+    def finetune_spec(self) -> FineTuneSpec:
+        """Which parameters are which component, and which of them LoRA adapts."""
         raise NotImplementedError
-
-    def answer(
-        self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
-    ) -> Tensor:
-        """A normalised chunk [n, h, a] for what `observation` saw, through what the episodes remember."""
-        raise NotImplementedError
-
-    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """Which frames of the memory camera are looked at, beside the current ones, when acting at these steps.
-
-        A simulation draws no others. By default None: every frame of every camera may be.
-
-        Args:
-            steps: [n] current frames, video included. exec_start: the first execution frame.
-
-        Returns:
-            int64 [n], ascending, each once; or None.
-        """
-        return None
-
-    def encode_frames(self, frames: np.ndarray) -> Tensor:
-        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them.
-
-        Only policies with a memory that stores vision tokens are asked.
-        """
-        raise NotImplementedError
-
-    def vision_fingerprint(self) -> str:
-        """A hash of what the tokens of `encode_frames` depend on, and a cache of them."""
-        raise NotImplementedError
-
-    def check_processor(self, source: str) -> None:
-        """Make sure that the network and its processor are for the same robot; a subclass compares their sizes too."""
-        processor = self.require_processor()
-        robot = embodiment_of(self.config)
-        if self.config.get("embodiment") is not None and robot != processor.embodiment:
-            raise UserError(
-                f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
-                f"{brief(robot.name)}, or the two say different things of it. The files are from two checkpoints, or "
-                "one was changed."
-            )
-
-    # Costs
-
-    def full_batch(self, device: torch.device | str = "cpu") -> Any:
-        """A batch of one without content, at its fullest: every view and word, a full memory, actions to learn from."""
-        raise NotImplementedError
-
-    def see_empty_frame(self) -> None:
-        """Run the vision tower on one black memory frame."""
-        raise NotImplementedError
-
-    # Parts
-
-    frozen: str | None = None
-    """Pattern of the parameters that never learn, whatever fine-tuning asks for."""
-    keyframes: int = 1
-    """Keyframes of a training sample, where samples are such."""
-    adapted: Sequence[str] = ()
-    """Linear layers that LoRA wraps unless told otherwise, by the end of their name."""
-    heads: Sequence[str] = ()
-    """Modules that learn in full beside the adapters, by the end of their name."""
-    unadaptable: str | None = None
-    """Pattern of linear layers whose weight is read past any adapter that wraps them."""
-
-    def parts(self) -> Mapping[str, str]:
-        """Part → pattern of its parameters' names, in order; the first that matches decides.
-
-        Fine-tuning, `inspect` and reports speak of these: `vision`, `vlm`, `action`, `memory`.
-        """
-        raise NotImplementedError
-
-    def part_of(self, name: str) -> str:
-        """The part that a parameter belongs to."""
-        for part, pattern in self.parts().items():
-            if re.match(pattern, name):
-                return part
-        raise ValueError(f"No part of {type(self).__name__} holds {name!r}; the last pattern must match the rest.")
-
-    def require_memory(self) -> Memory:
-        """Return the memory, or say that there is none."""
-        if self.memory is None:
-            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
-        return self.memory
 
     def require_processor(self) -> "PolicyProcessor":
-        """Return the processor, or say what it takes to have one."""
+        """Return the processor.
+
+        Raises:
+            UserError: the policy was built without one.
+        """
         if self.processor is None:
             raise UserError(
                 "This policy was built without a processor, so it can run batches but no raw data: build it with "
                 "build_policy() or load it with from_pretrained()."
             )
         return self.processor
+
+    # Training
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """Sample the random numbers for the losses of `count` samples, on the CPU: each value [count, …]."""
+        return {}
+
+    def forward(self, batch: Any, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of a batch, and metrics to log (detached).
+
+        Args:
+            batch: with `actions`. noise: of `training_noise`, on the policy's device; sampled by default.
+        """
+        raise NotImplementedError
+
+    # Sampling
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """Sample the random numbers for one chunk, on the CPU, without a batch axis."""
+        return {}
+
+    def sample_actions(self, batch: Any, noise: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
+        """Sample a normalised chunk [b, h, a].
+
+        Args:
+            noise: of `sampling_noise`, with a batch axis, on the policy's device; sampled by default.
+            steps: of an iterative sampler; its default by default.
+        """
+        raise NotImplementedError
+
+    # Episodes
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode. Its memory, noise and current view are in the returned object alone."""
+        return Episode(self, goal, seed)
+
+    def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
+        """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
+
+        Returns:
+            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them, without the steps
+            of a chunk that lie in the past.
+        """
+        if isinstance(episodes, Episode):
+            single: np.ndarray = self.act([episodes], steps)[0]
+            return single
+        processor, space = self.require_processor(), self.embodiment.action
+        n_past = processor.samples.window - 1
+        if not episodes:
+            return np.zeros((0, self.horizon - n_past, space.width), np.float32)
+        supports_rtc = isinstance(self, SupportsRTC) and self.supports_rtc
+        if not supports_rtc and any(e.action_prefix is not None for e in episodes):
+            name = self.config.get("name", type(self).__name__)
+            raise UserError(
+                f"{name} does not support real-time chunking, which needs a flow policy such as π0.5. Leave out "
+                "set_action_prefix()."
+            )
+        processor.require_stats()  # before the noise or memory of an episode changes
+        batch = self.observation(episodes)
+        noise = stack_noise([e.draw() for e in episodes])
+        was_training = self.training
+        self.eval()
+        try:
+            chunk = self.predict_chunk(batch, episodes, noise, steps).float().cpu()
+        finally:
+            self.train(was_training)
+        absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
+        decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
+        actions = torch.stack(decided).numpy()[:, n_past:]
+        for episode, actions_of in zip(episodes, actions, strict=True):
+            episode.acted(actions_of)
+        return actions
+
+    def observation(self, episodes: Sequence[Episode]) -> Any:
+        """The current observations of episodes, as a batch of the processor's kind on the policy's device."""
+        raise NotImplementedError
+
+    def predict_chunk(
+        self, batch: Any, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """Sample a normalised chunk [n, h, a] for an `observation`, with the memories of the episodes."""
+        raise NotImplementedError
+
+    # Folders
+
+    @classmethod
+    def from_config(
+        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
+    ) -> Self:
+        """Build from plain sections.
+
+        Args:
+            fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not initialised.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        source: str | Path,
+        *,
+        device: str | torch.device = "cpu",
+        dtype: str = "float32",
+        revision: str | None = None,
+        token: str | None = None,
+        trust_plugins: bool = False,
+        tokenizer: str | Path | None = None,
+        **policy: Any,
+    ) -> Self:
+        """Load what `save_pretrained` wrote; of a training checkpoint, the EMA weights.
+
+        `Policy.from_pretrained` loads every kind of policy, a subclass only its own.
+
+        Args:
+            source: a folder (of a checkpoint; of a run, for its newest checkpoint; `…/latest`, for the newest run), or
+                `owner/name` of a hub repository.
+            device: where to put the weights.
+            dtype: of the weights. `bfloat16` halves the memory, for inference: compute is then bfloat16 too, and no
+                weight requires a gradient. `auto`: bfloat16 on a GPU if the policy is made for it, else float32.
+            revision: branch, tag or commit of the repository. token: for private repositories.
+            trust_plugins: import the modules that the checkpoint names under `plugins`. They run code of its author.
+            tokenizer: in place of the checkpoint's own, which is fetched from the hub only if it is π0.5's.
+            policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
+
+        Raises:
+            UserError: no checkpoint at `source`, or files that do not fit together.
+        """
+        where, trust = {"revision": revision, "token": token}, trust_plugins
+        return load_policy(
+            cls, source, device=device, dtype=dtype, trust_plugins=trust, tokenizer=tokenizer, options=policy, **where
+        )
+
+    def save_pretrained(
+        self, folder: str | Path, *, dtype: str = "float32", card: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write weights, configuration, statistics and tokenizer, with checksums in `SHA256SUMS`.
+
+        Args:
+            dtype: of the stored weights: `float32` or `bfloat16`.
+            card: facts for the model card, kept in the configuration: `data` (text), `recipe`, `results` (tables),
+                `license`, `base_model`, `datasets` (ids on the hub).
+        """
+        save_policy(self, Path(folder), dtype=dtype, card=card)
+
+    def push_to_hub(
+        self,
+        repo_id: str,
+        *,
+        private: bool = False,
+        token: str | None = None,
+        revision: str | None = None,
+        message: str = "Upload policy",
+        dtype: str = "float32",
+        card: Mapping[str, Any] | None = None,
+    ) -> str:
+        """Store the policy on the Hugging Face Hub, as `save_pretrained` writes it; return the repository's address.
+
+        Args:
+            repo_id: `owner/name`; created if it does not exist. private: only if it is created now.
+            token: a write token; the one stored by `hf auth login` by default.
+            revision: the branch to commit to. message: of the commit. dtype, card: as for `save_pretrained`.
+        """
+        options = {"private": private, "token": token, "revision": revision, "message": message}
+        return push_to_hub(self, repo_id, dtype=dtype, card=card, **options)

@@ -1,21 +1,81 @@
 """`build_policy`: from a variant's name to a policy, through the same YAML files the commands use."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.backbone.shapes_only import shapes_only
-from mme_vla.config.composition import compose, import_plugins
-from mme_vla.config.words import words
+from mme_vla.backbone.config import shapes_only
+from mme_vla.config.naming import words
+from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.errors import UserError
+from mme_vla.integration.base import Integration, extension_points
+from mme_vla.memory.base import Memory, check_grid, past_view_spec
 from mme_vla.policy.base import Policy
-from mme_vla.policy.kinds import policy_class
-from mme_vla.processing.base import DEFAULT, PolicyProcessor
+from mme_vla.policy.saving import policy_class
+from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
+from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.prompt import PROMPTS
-from mme_vla.registry import PROCESSORS
+from mme_vla.registry import MEMORIES, PROCESSORS
+
+
+def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: int) -> Memory:
+    """The memory of a configuration.
+
+    Args:
+        d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
+    """
+    memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
+    check_grid(memory, grid)
+    return memory
+
+
+def check_integrated(
+    config: Mapping[str, Any], integration: Integration, memory: Memory | None, supports: Set[str]
+) -> None:
+    """Make sure that memory, integration and backbone fit together."""
+    has_tokens = memory is not None and memory.budget > 0
+    if has_tokens != (integration.memory_width > 0):
+        if memory is not None and not has_tokens:
+            raise UserError(
+                f"The memory {config['memory']['name']!r} produces no tokens with these settings. Set integration=none "
+                "or memory.states=true."
+            )
+        mismatch = "an integration without a memory" if memory is None else "a memory without an integration"
+        raise UserError(f"This configuration names {mismatch}; name both, or neither for the memoryless policy.")
+    if memory is None:
+        return
+    check_past(config, memory, supports)
+    check_positions(config, integration, memory, supports)
+
+
+def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
+    """Make sure that the backbone reads past views if the memory gives them."""
+    if past_view_spec(memory) is not None and "past" not in supports:
+        raise UserError(
+            f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
+            f"and the tower of the backbone {config['backbone']['name']!r} sees one image at a time. Take another "
+            "memory, a backbone that hosts `past` (pi05), or past states alone (memory.views=false)."
+        )
+
+
+def check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, supports: Set[str]) -> None:
+    """Make sure that positions in time are possible: the tokens have a time, and the backbone takes positions."""
+    if integration.memory_position != "time":
+        return
+    if not memory.timed:
+        raise UserError(
+            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} have no time "
+            "each. Take memory_position=slot, or a memory that is `timed`."
+        )
+    if "blocks" in extension_points(type(integration)) and "positions" not in supports:
+        raise UserError(
+            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
+            "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
+        )
+
 
 SECTIONS = (
     "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
@@ -49,6 +109,8 @@ def build_policy(
 
     >>> policy = build_policy("framesamp_modul", memory={"budget": 256})  # doctest: +SKIP
     """
+    from mme_vla.config.composition import compose  # Hydra; a policy built in Python does without
+
     extra = [] if config_dir is None else [Path(config_dir)]
     config = compose("policy", policy_words(name, overrides), extra_dirs=extra)
     return build_from_config(config, device=device, seed=seed)
@@ -69,28 +131,24 @@ def build_from_config(
     """Build the policy a composed configuration describes; other sections (data, train, …) are ignored.
 
     Args:
-        fresh_backbone: False where a checkpoint is loaded next: π0.5's own weights are then not drawn.
+        fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not initialised.
     """
-    import_plugins(config)
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
-    sections = {key: plain[key] for key in SECTIONS if key in plain}
+    import_plugins(plugins_of(config, "the configuration"))
+    container = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(container, dict)
+    sections = {key: container[key] for key in SECTIONS if key in container}
     check_token_budget(sections)
-    # Shapes need no words: on meta the full-size tokenizer is not asked for.
+    # On meta the tokenizer is not needed.
     bare = torch.device(device).type == "meta"
     processor = None if bare else build_processor(sections)
     with torch.random.fork_rng(devices=[]), shapes_only() if bare else torch.device(device):
-        torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
+        torch.manual_seed(container.get("seed", 42) if seed is None else seed)
         policy: Policy = policy_class(sections).from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()
 
 
 def check_token_budget(sections: Mapping[str, Any]) -> None:
-    """Make sure that memory and subgoal together stay within `token_budget`, where there is one.
-
-    Raises:
-        UserError: they do not, or the subgoal has no limit.
-    """
+    """Make sure that memory and subgoal together stay within `token_budget`, where there is one."""
     budget = sections.get("token_budget")
     if budget is None:
         return
@@ -107,15 +165,10 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
 
 
 def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
-    """Build the processor of a composed configuration (`processor.name`), at its backbone's sizes.
-
-    Raises:
-        UserError: no processor, an unknown one or setting, or a tokenizer that cannot be had.
-    """
     if not sections.get("processor"):
         raise UserError(
             f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under `defaults` of its file "
             "write `/processor@_global_.processor: tiny`, or the name of a configs/processor file of your own."
         )
-    kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT)]
+    kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT_PROCESSOR)]
     return kind.from_sections(sections)

@@ -1,4 +1,4 @@
-"""One running episode: all streaming state lives here, never on the policy."""
+"""One running episode: all streaming state is here, never on the policy."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
@@ -9,67 +9,65 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
+from mme_vla.memory.base import past_view_spec, start_history, start_stream, uses_proprio
 from mme_vla.memory.history import History, OnlineHistory
-from mme_vla.policy.promises import Promise, checked_promise
-from mme_vla.processing.limits import check_reach, finite_array
-from mme_vla.processing.past_views import PastPictures
+from mme_vla.policy.action_prefix import ActionPrefix, checked_prefix
+from mme_vla.policy.capabilities import with_vision_memory
+from mme_vla.processing.base import motion_rows
+from mme_vla.processing.images import PastImages
+from mme_vla.processing.normalise import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
-from mme_vla.types import HistoryTokens, PastViews
+from mme_vla.types import FrameBatch, HistoryTokens, PastViews
 
 if TYPE_CHECKING:
-    from mme_vla.memory.base import Memory
+    from mme_vla.memory.base import MemoryModule
     from mme_vla.processing.base import PolicyProcessor
 
 
 class Host(Protocol):
-    """What an episode asks of its policy."""
+    """What an episode needs of its policy."""
 
     @property
-    def memory(self) -> "Memory | None": ...
+    def memory(self) -> "MemoryModule | None": ...
 
     @property
     def embodiment(self) -> Embodiment: ...
 
-    def require_memory(self) -> "Memory": ...
-
     def require_processor(self) -> "PolicyProcessor": ...
 
-    def encode_frames(self, frames: np.ndarray) -> Tensor: ...
-
-    def sample_draws(self, generator: torch.Generator) -> dict[str, Tensor]: ...
+    def sampling_noise(self, generator: torch.Generator) -> dict[str, Tensor]: ...
 
 
 class Episode:
-    """What the policy knows of one episode: goal, current view and state, and the history of past frames."""
+    """State of one episode: goal, current view and robot state, history of past frames, noise."""
 
     def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
-        self._policy = policy
+        self._policy, self._robot = policy, policy.embodiment
         self._generator = torch.Generator().manual_seed(seed)
-        self._seen: list[tuple[Tensor | None, Tensor]] = []  # None: that frame was not drawn
-        """Pictures and states of the frames that the policy sees at once, the current one last."""
+        self._recent: list[tuple[Tensor | None, Tensor]] = []
+        """Images (None: not rendered) and states of the observation's window, the current frame last."""
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
         self.options: tuple[Option, ...] = ()
-        """What can be chosen, for policies that choose; set it before `act`."""
+        """The options of policies that choose among some; set them before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else memory.start_history(policy.encode_frames)
-        if self.history is not None and memory is not None and memory.reads_motion:
-            self.history.motion = lambda frames: torch.stack([self._moved[int(frame)] for frame in frames])
+        self.history = None if memory is None else start_history(memory, with_vision_memory(policy).encode_frames)
+        if self.history is not None and uses_proprio(memory):
+            self.history.motion = lambda frames: torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
             self.history.state_width = policy.embodiment.state.width
-        self.stream = None if memory is None else memory.start_stream()
-        """What the memory carries from one `act` to the next, where it has something to carry."""
+        self.stream = start_stream(memory)
+        """State of a streaming memory between two `act`s."""
         self.read: History | None = None
-        """The history as the last `act` read it, where a backbone marks what is stored."""
-        look = None if memory is None else memory.looks_back
-        self._past = None if look is None else PastPictures(look)
-        self.frames_seen = 0
-        self._moved: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
+        """The history as the last `act` read it, conditioned on the prompt."""
+        spec = past_view_spec(memory)
+        self._past = None if spec is None else PastImages(spec)
+        self.n_observed_frames = 0
+        self._motion_of_frames: list[Tensor] = []  # rows [w], one a frame, if the memory reads motion
         self._chunk: np.ndarray | None = None
-        self.promised: Promise | None = None
-        """What the next chunk is to agree with; see `promise`."""
-        self._robot = policy.embodiment
+        self.action_prefix: ActionPrefix | None = None
+        """See `set_action_prefix`."""
         self._executed = self._no_actions
 
     def observe(
@@ -78,65 +76,66 @@ class Episode:
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
-        drawn: Mapping[str, np.ndarray] | None = None,
+        rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames in order, each once, the current one last; the conditioning video comes first.
 
         Args:
             frames: of every camera by its name (`front` and `wrist`), each [t, H, W, 3] uint8.
-            drawn: of every camera the places, ascending, among the t frames that `frames` shows, where not all were
-                drawn. `act` needs the last one of every camera; of the others a memory needs what its `frames_read`
-                names.
             states: [t, s].
             is_demo: whether the frames belong to the conditioning video; one bool, or [t].
-            actions: [t, w] absolute actions that led to these frames. By default they are the first t of the last
-                chunk, one action a frame; give them where something else was executed. Where an action is a motion of
-                many frames, however many it were: [n, w].
+            actions: [t, w] absolute actions that led to these frames; by default the first t of the last chunk, one
+                action a frame. If an action is a motion of many frames, any number of them: [n, w].
+            rendered: by camera the indices, ascending, of the t frames that `frames` shows, if not all are rendered.
+                `act` needs the last one of every camera, a memory those of its `frames_read`.
 
         Raises:
             UserError: a missing camera, a wrong dtype or shape, or a video frame after execution has begun.
         """
-        # Everything is checked before anything is remembered: after an error the same frames can be given again.
-        views = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
+        # All checks come first: after an error the same frames can be observed again.
+        images = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count, width = len(states) if states.ndim else 0, self._robot.state.width
-        even = all(len(view) == (count if drawn is None else len(drawn[name])) for name, view in views.items())
+        even = all(len(view) == (count if rendered is None else len(rendered[name])) for name, view in images.items())
         if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
-            counts = ", ".join(f"{len(view)} {name}" for name, view in views.items())
+            counts = ", ".join(f"{len(view)} {name}" for name, view in images.items())
             raise UserError(
                 f"observe() needs as many {width}-number states and is_demo flags as images of every camera: got "
                 f"{counts}, states of shape {states.shape} and is_demo of {demo.shape}."
             )
         if count == 0:
             return
+        views = {
+            name: FrameBatch.of(view, None if rendered is None else rendered[name], count)
+            for name, view in images.items()
+        }
         processor = self._policy.require_processor()
         check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
         demo, executed = self._checked_course(count, demo, actions)
-        # Of the frames that the window has room for, those of the execution; the current one in any case.
-        recent = range(max(count - processor.window, 0) if processor.consecutive else count - 1, count)
-        seen = [
-            (self._pictures(views, drawn, i), torch.from_numpy(states[i].copy()))
+        # Execution frames within the window; the current frame in any case.
+        samples = processor.samples
+        recent = range(max(count - samples.window, 0) if samples.consecutive else count - 1, count)
+        new_frames = [
+            (self._prepared_images(views, i), torch.from_numpy(states[i].copy()))
             for i in recent
             if i == count - 1 or not demo[i]
         ]
-        camera = self._robot.memory_camera
-        seen_at = None if drawn is None else np.asarray(drawn[camera], np.int64)
-        self._take(views[camera], demo, executed, seen_at, states)
+        self._take(views[self._robot.memory_camera], demo, executed, states)
         if self._past is not None:
-            self._past.take(views, count, drawn)
-        self._see(seen)
+            self._past.take(views)
+        self._set_window(new_frames)
 
-    def remember(
+    def add_frames(
         self,
         frames: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
         states: np.ndarray | None = None,
     ) -> None:
-        """Take frames into memory alone, for a client that sends past frames and the current view apart.
+        """Add frames to memory alone, for a client that sends past frames and the current view apart.
 
-        Followed by `look` at the last of them it is what `observe` does.
+        `add_frames`, then `set_view` at the last of them, is what `observe` does.
 
         Args:
             frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
@@ -144,9 +143,9 @@ class Episode:
 
         Raises:
             UserError: a wrong dtype or shape, a video frame after execution has begun, a memory that needs states, or
-                one that looks back at pictures of every camera.
+                one that reads past images of every camera.
         """
-        self._check_apart()
+        self._require_single_view()
         camera = self._robot.memory_camera
         frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
@@ -155,36 +154,141 @@ class Episode:
         if states is not None and np.shape(states) != (len(frames), self._robot.state.width):
             raise UserError(f"states must be [{len(frames)}, {self._robot.state.width}]; got {list(np.shape(states))}.")
         if len(frames):
-            felt = None if states is None else finite_array(states, "states")
-            self._take(frames, *self._checked_course(len(frames), demo, actions), states=felt)
+            proprio = None if states is None else finite_array(states, "states")
+            self._take(FrameBatch.of(frames), *self._checked_course(len(frames), demo, actions), states=proprio)
 
-    def look(self, pictures: Mapping[str, np.ndarray], state: np.ndarray) -> None:
+    def set_view(self, views: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
 
         Args:
-            pictures: of every camera by its name, [H, W, 3] uint8.
-            state: [s].
+            views: of every camera by its name, [H, W, 3] uint8. state: [s].
 
         Raises:
-            UserError: pictures or a state of another form, or a memory that looks back at pictures of every camera.
+            UserError: images or a state of another form, or a memory that reads past images of every camera.
         """
-        self._check_apart()
+        self._require_single_view()
         state = finite_array(state, "the state")
         width, names = self._robot.state.width, self._robot.camera_names
         if state.shape != (width,):
-            raise UserError(f"look() needs a state of {width} finite numbers, got shape {state.shape}.")
-        if lacking := [name for name in names if name not in pictures]:
-            raise UserError(f"look() needs a picture of {', '.join(lacking)} too; got {', '.join(pictures) or 'none'}.")
+            raise UserError(f"set_view() needs a state of {width} finite numbers, got shape {state.shape}.")
+        if lacking := [name for name in names if name not in views]:
+            raise UserError(f"set_view() needs an image of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
-        images = processor.images([pictures[name] for name in names])
-        self._see([(images, torch.from_numpy(state.copy()))])
+        self._set_window([(processor.images([views[name] for name in names]), torch.from_numpy(state.copy()))])
 
-    def _check_apart(self) -> None:
+    def gather_selection(self) -> HistoryTokens:
+        """The memory's selection at the current frame, unbatched."""
+        history = self.required_history()
+        return self._memory.gather_selection(history, len(history) - 1)
+
+    def required_history(self) -> OnlineHistory:
+        """The history, once it has a frame.
+
+        Raises:
+            UserError: the policy has no memory, or no frame was observed.
+        """
+        if self.history is None:
+            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+        self._require_observation()
+        return self.history
+
+    @property
+    def images(self) -> Tensor:
+        """The current views [v, 3, s, s] uint8.
+
+        Raises:
+            UserError: no frame was observed, or the current one was not rendered.
+        """
+        self._require_observation()
+        return self._require_rendered(self._recent[-1][0])
+
+    @property
+    def state(self) -> Tensor:
+        """The current state [s]."""
+        self._require_observation()
+        return self._recent[-1][1]
+
+    @property
+    def window(self) -> tuple[Tensor, Tensor]:
+        """Views [t, v, 3, s, s] uint8 and states [t, s] of the observation's window, the current frame last.
+
+        The oldest frame is repeated until the execution has as many.
+
+        Raises:
+            UserError: no frame was observed, or one of these was not rendered.
+        """
+        self._require_observation()
+        missing = self._policy.require_processor().samples.window - len(self._recent)
+        frames = [self._recent[0]] * missing + self._recent
+        images = torch.stack([self._require_rendered(images) for images, _ in frames])
+        return images, torch.stack([state for _, state in frames])
+
+    @property
+    def past(self) -> PastViews | None:
+        """Past views that the memory gives with the current ones, unbatched.
+
+        Raises:
+            UserError: one of them was not rendered.
+        """
+        if self._past is None:
+            return None
+        return self._past.at(self.n_observed_frames - 1, self._policy.require_processor().images)
+
+    @property
+    def prompt(self) -> Any:
+        """The processor's encoding of goal and subgoal."""
+        processor, state = self._policy.require_processor(), self._recent[-1][1] if self._recent else None
+        goal = self._robot.action.worded(self.goal, self.options)
+        return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
+
+    def set_action_prefix(self, actions: np.ndarray, delay: int = 0) -> None:
+        """Make the next chunk, and it alone, continue actions that the robot executes meanwhile (real-time chunking).
+
+        Args:
+            actions: [n, w], as the embodiment executes them: the remaining ones of the chunk before, the current one
+                first. delay: how many of them are executed before the next chunk is there; these count in full, the
+                others less and less.
+
+        Raises:
+            UserError: actions of another form, more than a chunk, or a delay beyond them.
+        """
+        space = self._robot.action
+        self.action_prefix = checked_prefix(actions, delay, space.horizon, space.width)
+
+    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+        """Note the frames at which sub-tasks began, if the environment reports them; only probes use it."""
+
+    def acted(self, chunk: np.ndarray) -> None:
+        """Note the chunk [h, w] of the policy; the frames that follow tell how much of it was executed."""
+        self._chunk, self.action_prefix = chunk, None
+
+    @property
+    def noise_state(self) -> Tensor:
+        """State of the noise generator; set it back to repeat a batch that failed."""
+        return self._generator.get_state()
+
+    @noise_state.setter
+    def noise_state(self, state: Tensor) -> None:
+        self._generator.set_state(state)
+
+    def draw(self) -> dict[str, Tensor]:
+        """Sample the next chunk's random numbers from this episode's own generator, independent of batching."""
+        return self._policy.sampling_noise(self._generator)
+
+    @property
+    def _memory(self) -> "MemoryModule":
+        return with_vision_memory(self._policy).require_memory()
+
+    @property
+    def _no_actions(self) -> np.ndarray:
+        return np.zeros((0, self._robot.action.width), np.float32)
+
+    def _require_single_view(self) -> None:
         if self._past is not None:
             raise UserError(
-                "This policy's vision tower looks back at past pictures of every camera: give whole observations "
-                "(`Episode.observe`), not past frames of one camera and the current view apart."
+                "This policy's vision tower reads past images of every camera: use `Episode.observe`, not past frames "
+                "of one camera and the current view apart."
             )
 
     def _checked_course(
@@ -196,188 +300,69 @@ class Episode:
             raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
         return demo, self._executed_now(int((~demo).sum()), actions)
 
-    def _take(
-        self,
-        frames: np.ndarray,
-        demo: np.ndarray,
-        executed: np.ndarray,
-        drawn: np.ndarray | None = None,
-        states: np.ndarray | None = None,
-    ) -> None:
-        """Append checked frames to the history, and note what was executed."""
-        if self.history is not None:
-            moved = self._motion(demo, executed, states)
-            self.history.take(frames, self._policy.encode_frames, drawn, len(demo))
-            self._moved += moved
-            if not self._video_over:
-                self.history.exec_start = self.frames_seen + int(demo.sum())
-        longest = self._policy.require_processor().past_actions
-        past = np.concatenate([self._executed, executed])
-        self._executed = past[max(len(past) - longest, 0) :]
-        self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
-        self._video_over = self._video_over or not bool(demo[-1])
-        self.frames_seen += len(demo)
-
-    def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
-        """Rows of motion of the next frames, for a memory that reads them.
-
-        Raises:
-            UserError: it does, and there are no states, or no statistics.
-        """
-        if not self._policy.require_memory().reads_motion:
-            return []
-        if states is None:
-            raise UserError(
-                "This policy's memory reads the robot's own states and actions: give past frames with their states "
-                "(`Episode.observe`), not as pictures alone."
-            )
-        actions, own = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
-        if self._robot.action.frames is not None:
-            places = np.flatnonzero(~demo)[: len(executed)]
-            actions[places], own[places] = executed[: len(places)], True
-        return list(self._policy.require_processor().motion(states, actions, own))
-
-    def recall(self) -> HistoryTokens:
-        """The memory's selection at the current frame, unbatched."""
-        history = self.required_history()
-        return self._policy.require_memory().recall(history, len(history) - 1)
-
-    def required_history(self) -> OnlineHistory:
-        """The history, once there is something in it.
-
-        Raises:
-            UserError: the policy has no memory, or the episode has seen no frame.
-        """
-        self._policy.require_memory()
-        self._require_observation()
-        assert self.history is not None
-        return self.history
-
-    @property
-    def images(self) -> Tensor:
-        """The current views [v, 3, s, s] uint8.
-
-        Raises:
-            UserError: no frame was seen yet, or the current one was not drawn.
-        """
-        self._require_observation()
-        return self._drawn(self._seen[-1][0])
-
-    @property
-    def state(self) -> Tensor:
-        """The current state [s]."""
-        self._require_observation()
-        return self._seen[-1][1]
-
-    @property
-    def window(self) -> tuple[Tensor, Tensor]:
-        """Views [t, v, 3, s, s] uint8 and states [t, s] of the frames that the policy sees at once, the current last.
-
-        Where fewer frames of the execution have been seen, the oldest stands for those before it.
-
-        Raises:
-            UserError: no frame was seen yet, or one of these was not drawn.
-        """
-        self._require_observation()
-        missing = self._policy.require_processor().window - len(self._seen)
-        seen = [self._seen[0]] * missing + self._seen
-        return torch.stack([self._drawn(images) for images, _ in seen]), torch.stack([state for _, state in seen])
-
-    @property
-    def past(self) -> PastViews | None:
-        """Views of earlier frames that the policy's memory gives along with the current ones, unbatched.
-
-        Raises:
-            UserError: one of them was not drawn.
-        """
-        if self._past is None:
-            return None
-        return self._past.at(self.frames_seen - 1, self._policy.require_processor().images)
-
-    @property
-    def prompt(self) -> Any:
-        """What the policy reads of the goal, and of the subgoal where it reads one."""
-        processor, state = self._policy.require_processor(), self._seen[-1][1] if self._seen else None
-        goal = self._robot.action.worded(self.goal, self.options)
-        return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
-
-    def promise(self, actions: np.ndarray, delay: int = 0) -> None:
-        """Let the next chunk, and it alone, agree with actions that the robot executes while it is chosen.
-
-        Args:
-            actions: [n, w], as the embodiment executes them: those of the chunk before that are still to come, the
-                first one now. delay: how many of them will be executed before the next chunk is there; these count in
-                full, the others less and less.
-
-        Raises:
-            UserError: actions of another form, more than a chunk, or a delay that they do not cover.
-        """
-        space = self._robot.action
-        self.promised = checked_promise(actions, delay, space.horizon, space.width)
-
-    def begun(self, frames: Sequence[int], exec_start: int) -> None:
-        """Hear at which frames sub-tasks began, where an environment tells; only what probes a policy listens."""
-
-    def acted(self, chunk: np.ndarray) -> None:
-        """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""
-        self._chunk, self.promised = chunk, None
-
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
-        """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
+        """The actions that led to the last `count` frames; by default the next ones of the chunk."""
         space = self._robot.action
         if actions is None:
             return self._no_actions if self._chunk is None or space.frames is None else self._chunk[:count]
-        given = finite_array(actions, "actions")
-        if space.frames is None and given.ndim:
-            count = len(given)
-        executed = given[max(len(given) - count, 0) :] if given.ndim else given
+        values = finite_array(actions, "actions")
+        if space.frames is None and values.ndim:
+            count = len(values)
+        executed = values[max(len(values) - count, 0) :] if values.ndim else values
         if executed.shape != (count, space.width):
             raise UserError(
                 f"actions must be [{count}, {space.width}], one for each execution frame; got {executed.shape}."
             )
         return executed
 
-    @property
-    def _no_actions(self) -> np.ndarray:
-        return np.zeros((0, self._robot.action.width), np.float32)
+    def _take(
+        self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None
+    ) -> None:
+        """Append checked frames of the memory camera to the history, and the actions that led to them."""
+        if self.history is not None:
+            motion = self._motion(demo, executed, states)
+            self.history.take(frames, with_vision_memory(self._policy).encode_frames)
+            self._motion_of_frames += motion
+            if not self._video_over:
+                self.history.exec_start = self.n_observed_frames + int(demo.sum())
+        longest = self._policy.require_processor().prompt_spec.past_actions
+        past = np.concatenate([self._executed, executed])
+        self._executed = past[max(len(past) - longest, 0) :]
+        self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
+        self._video_over = self._video_over or not bool(demo[-1])
+        self.n_observed_frames += len(demo)
 
-    @property
-    def noise_state(self) -> Tensor:
-        """Where the noise stands. Set back, it draws the same again: for a batch that failed and is repeated."""
-        return self._generator.get_state()
+    def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
+        """Rows of motion of the next frames, if the memory reads them."""
+        if not uses_proprio(self._memory):
+            return []
+        if states is None:
+            raise UserError(
+                "This policy's memory reads the robot's own states and actions: give past frames with their states "
+                "(`Episode.observe`), not as images alone."
+            )
+        actions, known = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
+        if self._robot.action.frames is not None:
+            rows = np.flatnonzero(~demo)[: len(executed)]
+            actions[rows], known[rows] = executed[: len(rows)], True
+        return list(motion_rows(self._policy.require_processor(), states, actions, known))
 
-    @noise_state.setter
-    def noise_state(self, state: Tensor) -> None:
-        self._generator.set_state(state)
+    def _prepared_images(self, views: Mapping[str, FrameBatch], frame: int) -> Tensor | None:
+        """The views of a frame as the network takes them; None unless all cameras rendered it."""
+        images = [image for view in views.values() if (image := view.image(frame)) is not None]
+        return self._policy.require_processor().images(images) if len(images) == len(views) else None
 
-    def draw(self) -> dict[str, Tensor]:
-        """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
-        return self._policy.sample_draws(self._generator)
+    def _set_window(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
+        self._recent = [*self._recent, *frames][-self._policy.require_processor().samples.window :]
 
-    def _pictures(
-        self, views: Mapping[str, np.ndarray], drawn: Mapping[str, np.ndarray] | None, frame: int
-    ) -> Tensor | None:
-        """One of the frames given as the network takes it; None where a camera did not show it."""
-        if drawn is None:
-            shown = [view[frame] for view in views.values()]
-        elif all(frame in drawn[name] for name in views):
-            shown = [view[int(np.searchsorted(drawn[name], frame))] for name, view in views.items()]
-        else:
-            return None
-        return self._policy.require_processor().images(shown)
-
-    def _drawn(self, images: Tensor | None) -> Tensor:
+    def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:
-            raise UserError("The current frame was not drawn: observe() a picture of every camera before act().")
+            raise UserError("The current frame was not rendered: observe() an image of every camera before act().")
         return images
 
-    def _see(self, seen: Sequence[tuple[Tensor | None, Tensor]]) -> None:
-        """Take what is new into the window."""
-        self._seen = [*self._seen, *seen][-self._policy.require_processor().window :]
-
     def _require_observation(self) -> None:
-        if not self._seen:
-            raise UserError("The episode has seen no frame yet: call observe() with the current frame before act().")
+        if not self._recent:
+            raise UserError("No frame was observed yet: call observe() with the current frame before act().")
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
         if view not in frames:

@@ -1,13 +1,14 @@
 """Which parameters of a policy learn: all of them, the action side, or low-rank adapters (configs/finetune).
 
-A policy says which parameters are which part (`Policy.parts`). Of π0.5, from the outside in: `vision` (tower and
+`Policy.finetune_spec` maps parameters to components. Of π0.5, from the outside in: `vision` (tower and
 projector), `vlm` (token embedding and VLM expert), `action` (action expert, its final norm, action and time heads) and
 `memory` (memory, integration, and the memory's own expert).
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -15,36 +16,42 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
 from mme_vla.policy.tensor_files import dtype_of
 
+if TYPE_CHECKING:
+    from mme_vla.policy.base import Policy
+
 MODES = ("full", "expert_only", "lora")
 INITS: Mapping[str, Any] = {"uniform": True, "gaussian": "gaussian"}  # ours → peft's
 ADAPTER = "default"  # peft's name of the one adapter a policy carries
 
 
-class Tunable(Protocol):
-    """What fine-tuning asks of a policy, which is an `nn.Module` besides; see `Policy` for the words."""
+@dataclass(frozen=True)
+class FineTuneSpec:
+    """How a policy can be fine-tuned.
 
-    config: dict[str, Any]
-    adapted: Sequence[str]
-    heads: Sequence[str]
-    unadaptable: str | None
-    frozen: str | None
-    compute_dtype: torch.dtype
+    components: name → pattern of the parameters' names, in order; the first match counts, the last pattern must match
+        the remaining ones. Usual names are `vision`, `vlm`, `action` and `memory`.
+    lora_targets: linear layers that LoRA wraps by default, by the end of their name.
+    full_train: modules that train in full beside the adapters, by the end of their name.
+    lora_exclude: pattern of linear layers whose weight is read past any adapter that wraps them.
+    frozen: pattern of the parameters that never train.
+    """
 
-    def parts(self) -> Mapping[str, str]: ...
+    components: Mapping[str, str]
+    lora_targets: Sequence[str] = ()
+    full_train: Sequence[str] = ()
+    lora_exclude: str | None = None
+    frozen: str | None = None
 
-    def part_of(self, name: str) -> str: ...
-
-    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]: ...
-
-    def named_modules(self) -> Iterator[tuple[str, nn.Module]]: ...
-
-    def parameters(self) -> Iterator[nn.Parameter]: ...
-
-    def get_submodule(self, target: str) -> nn.Module: ...
+    def component_of(self, name: str) -> str:
+        """The component of a parameter."""
+        for component, pattern in self.components.items():
+            if re.match(pattern, name):
+                return component
+        raise ValueError(f"No component has the parameter {name!r}; the last pattern must match the remaining names.")
 
 
 def apply_finetuning(
-    policy: Tunable,
+    policy: "Policy",
     mode: str = "full",
     *,
     freeze_vision: bool = True,
@@ -65,50 +72,44 @@ def apply_finetuning(
             `targets`, and in full what `train` names.
         freeze_vision: leave the vision tower as it is in every mode; needed where a memory reads cached tokens.
         rank, alpha, dropout: of the adapters: W + (alpha / rank)·B·A.
-        init: how A is drawn: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins at zero.
+        init: distribution of A: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins at zero.
         targets: linear layers and convolutions, by the end of their name: `experts.vlm.qkv` is that matrix in every
-            layer. By default those the policy names (`Policy.adapted`).
+            layer. By default those the policy names (`Policy.finetune_spec`).
         train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`. By
             default the memory and the policy's heads.
-        frozen_dtype: `bfloat16` holds what does not learn at half the size, as the released training does; it rounds
-            those weights, and asks for compute in bfloat16.
+        frozen_dtype: `bfloat16` holds what is not trained at half the size, as the released training does; it rounds
+            those weights, and requires compute in bfloat16.
 
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
-
-    Raises:
-        UserError: an unknown mode or dtype, or a name that matches nothing.
     """
     if mode not in MODES:
         raise UserError(f"finetune.mode={mode!r}. {did_you_mean(str(mode), MODES)}")
     check_frozen_dtype(policy, frozen_dtype)
-    train = ("memory", *policy.heads) if train is None else train
+    spec = policy.finetune_spec
+    train = ("memory", *spec.full_train) if train is None else train
     if mode == "lora":
         in_full = _named(policy, train)  # before anything is changed
         add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets)
     for name, parameter in policy.named_parameters():
-        part = policy.part_of(name)
+        part = spec.component_of(name)
         if mode == "full":
             learns = True
         elif mode == "expert_only":
             learns = part in ("action", "memory")
         else:
             learns = ".lora_" in name or any(name.startswith(f"{module}.") for module in in_full) or part in train
-        fixed = policy.frozen is not None and re.match(policy.frozen, name) is not None
+        fixed = spec.frozen is not None and re.match(spec.frozen, name) is not None
         parameter.requires_grad_(learns and not fixed and not (part == "vision" and freeze_vision))
     cast_frozen(policy, frozen_dtype)
-    counts = dict.fromkeys(policy.parts(), 0)
+    counts = dict.fromkeys(spec.components, 0)
     for name, parameter in policy.named_parameters():
-        counts[policy.part_of(name)] += parameter.numel() if parameter.requires_grad else 0
+        counts[spec.component_of(name)] += parameter.numel() if parameter.requires_grad else 0
     return counts
 
 
-def check_frozen_dtype(policy: Tunable, name: str | None) -> None:
-    """Make sure that a policy can compute with frozen weights of this dtype (None: as they are).
-
-    Raises:
-        UserError: it is none, or the policy computes in float32.
-    """
+def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
+    """Make sure that a policy can compute with frozen weights of this dtype (None: as they are)."""
     if name is None:
         return
     if dtype_of(name, "finetune.frozen_dtype") != torch.float32 and policy.compute_dtype == torch.float32:
@@ -118,8 +119,8 @@ def check_frozen_dtype(policy: Tunable, name: str | None) -> None:
         )
 
 
-def cast_frozen(policy: Tunable, name: str | None) -> None:
-    """Hold what does not learn in this dtype (None: as it is)."""
+def cast_frozen(policy: "Policy", name: str | None) -> None:
+    """Hold what is not trained in this dtype (None: as it is)."""
     if name is not None:
         for parameter in policy.parameters():
             if not parameter.requires_grad and parameter.is_floating_point():
@@ -127,7 +128,7 @@ def cast_frozen(policy: Tunable, name: str | None) -> None:
 
 
 def add_adapters(
-    policy: Tunable,
+    policy: "Policy",
     *,
     rank: int,
     alpha: float,
@@ -135,12 +136,7 @@ def add_adapters(
     init: str = "uniform",
     targets: Sequence[str] | None = None,
 ) -> None:
-    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
-
-    Raises:
-        UserError: peft is not installed, the policy has adapters already, a size that is not positive, or a target that
-            matches no linear layer or one an adapter cannot reach.
-    """
+    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
     if policy.config.get("adapters") and _has_adapters(policy):
         raise UserError("This policy has adapters already: merge_adapters() first.")
     if rank < 1 or alpha <= 0 or not 0 <= dropout < 1:
@@ -149,19 +145,19 @@ def add_adapters(
         )
     if init not in INITS:
         raise UserError(f"finetune.init={brief(init)}. {did_you_mean(str(init), INITS)}")
-    targets = list(policy.adapted if targets is None else targets)
-    chosen = _targets(policy, targets)
+    targets = list(policy.finetune_spec.lora_targets if targets is None else targets)
+    target_modules = _targets(policy, targets)
     try:
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
         raise missing_extra("LoRA", "vlm") from None
-    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": chosen, "init_lora_weights": INITS[init]}
+    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": target_modules, "init_lora_weights": INITS[init]}
     config = LoraConfig(r=rank, lora_dropout=dropout, **options)
-    inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
+    inject_adapter_in_model(config, policy, ADAPTER)
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}
 
 
-def merge_adapters(policy: Tunable) -> None:
+def merge_adapters(policy: "Policy") -> None:
     """Fold the adapters into the matrices they wrap: a plain policy again, every parameter trainable."""
     from peft.tuners.tuners_utils import BaseTunerLayer
 
@@ -176,11 +172,7 @@ def merge_adapters(policy: Tunable) -> None:
 
 
 def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None) -> dict[str, Tensor]:
-    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes.
-
-    Raises:
-        UserError: what is said of the adapters does not fit the weights.
-    """
+    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes."""
     merged = {name.replace(".base_layer.", "."): tensor for name, tensor in tensors.items() if ".lora_" not in name}
     if not adapters:
         return merged
@@ -199,15 +191,16 @@ def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | Non
     return merged
 
 
-def _has_adapters(policy: Tunable) -> bool:
+def _has_adapters(policy: "Policy") -> bool:
     return any(".lora_" in name for name, _ in policy.named_parameters())
 
 
-def _targets(policy: Tunable, targets: Sequence[str]) -> list[str]:
+def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:
     """Full names of the layers that the targets mean (what is the memory's learns in full)."""
+    spec = policy.finetune_spec
     linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)]
-    layers = [name for name in linear if policy.part_of(f"{name}.") != "memory"]
-    chosen: list[str] = []
+    layers = [name for name in linear if spec.component_of(f"{name}.") != "memory"]
+    selected: list[str] = []
     for target in targets:
         matching = [name for name in layers if f".{name}".endswith(f".{target}")]
         if not matching:
@@ -215,33 +208,33 @@ def _targets(policy: Tunable, targets: Sequence[str]) -> list[str]:
                 f"finetune.targets: no linear layer of the policy's other parts ends in {target!r}. "
                 + _near(target, layers)
             )
-        past = policy.unadaptable
+        past = spec.lora_exclude
         unreachable = [name for name in matching if past is not None and re.search(past, name)]
         if unreachable:
             raise UserError(
                 f"finetune.targets: {target!r} means {unreachable[0]}, whose weight is used in float32 past any "
                 "adapter: it would never act. Train it in full (finetune.train), or leave it."
             )
-        chosen += matching
-    if not chosen:
+        selected += matching
+    if not selected:
         raise UserError(
-            f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(policy.adapted[:2])}."
+            f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(spec.lora_targets[:2])}."
         )
-    return sorted(set(chosen))
+    return sorted(set(selected))
 
 
-def _named(policy: Tunable, train: Sequence[str]) -> list[str]:
+def _named(policy: "Policy", train: Sequence[str]) -> list[str]:
     """Full names of the modules that `train` means; parts are left to the caller."""
-    modules = [name for name, _ in policy.named_modules() if name]
-    chosen: list[str] = []
+    modules, components = [name for name, _ in policy.named_modules() if name], policy.finetune_spec.components
+    selected: list[str] = []
     for entry in train:
         matching = [name for name in modules if f".{name}".endswith(f".{entry}")]
-        if not matching and entry not in policy.parts():
+        if not matching and entry not in components:
             raise UserError(
-                f"finetune.train: {entry!r} is no part and no module. {_near(entry, [*policy.parts(), *modules])}"
+                f"finetune.train: {entry!r} is no part and no module. {_near(entry, [*components, *modules])}"
             )
-        chosen += [] if entry in policy.parts() else matching
-    return chosen
+        selected += [] if entry in components else matching
+    return selected
 
 
 def _near(target: str, names: Sequence[str]) -> str:

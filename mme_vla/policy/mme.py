@@ -1,4 +1,4 @@
-"""`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
+"""`MMEPolicy`: the network `MMEModel` with a processor, episodes and checkpoints."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -10,42 +10,48 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import mme_vla.integration
-import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
-from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
-from mme_vla.backbone.layers.recomputing import Recompute
-from mme_vla.backbone.shape import read_backbone
-from mme_vla.backbone.shapes_only import shapes_only
-from mme_vla.backbone.shard_groups import ShardGroup
+from mme_vla.backbone.attention import check_backend
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets
+from mme_vla.backbone.config import read_backbone, shapes_only
+from mme_vla.backbone.flow import HasFlowHead
+from mme_vla.backbone.siglip import pool_grid
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, listed
-from mme_vla.integration.base import Integration, doors_of
-from mme_vla.memory.base import Memory
-from mme_vla.memory.history import MarkedHistory
+from mme_vla.errors import UserError, listed
+from mme_vla.integration.base import Integration, extension_points
+from mme_vla.memory.base import (
+    CompilableMemory,
+    MatmulPrecision,
+    MemoryModule,
+    StreamingMemory,
+    encode_histories,
+    full_history,
+    past_view_spec,
+)
+from mme_vla.memory.history import PromptConditionedHistory
+from mme_vla.model import MMEModel
+from mme_vla.policy.action_prefix import prefix_overlap
 from mme_vla.policy.base import Policy
-from mme_vla.policy.composing import build_memory, check_integrated
+from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.graphs import CapturedSampling
-from mme_vla.policy.kinds import policy_options
-from mme_vla.policy.masking import masked_mean
-from mme_vla.policy.promises import promised_overlap
-from mme_vla.policy.seeing import encode_frames, tower_fingerprint
-from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.processing.past_views import full_past, stack_past
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
+from mme_vla.policy.saving import policy_options
+from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens, send
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recomputes, Sharded
+from mme_vla.speed.graphs import CapturedSampling
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup, backbone_groups
+from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
 
 
 @POLICIES.register("mme")
-class MMEPolicy(Policy):
-    """One composition of backbone, memory and integration.
-
-    The two independent choices meet here and nowhere else; no method asks which variant it is.
-    """
+class MMEPolicy(MMEModel, NetworkPolicy):
+    """One composition of backbone, memory and integration, as a policy. No method depends on the variant."""
 
     acts_in_bfloat16 = True
     _sampler: CapturedSampling | None = None
@@ -53,7 +59,7 @@ class MMEPolicy(Policy):
     def __init__(
         self,
         backbone: Backbone,
-        memory: Memory | None,
+        memory: MemoryModule | None,
         integration: Integration,
         processor: "PolicyProcessor | None" = None,
         config: Mapping[str, Any] | None = None,
@@ -67,28 +73,30 @@ class MMEPolicy(Policy):
         """Put the parts together.
 
         Args:
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: what `from_config` was given; saved with the weights.
-            compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
-            history_dtype: dtype of stored vision tokens; bfloat16 as released.
-            augment: augment the current views while training (memory features never are).
-            attention: what computes it: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
+            processor, config, compute_dtype, history_dtype, augment: as for `NetworkPolicy`.
+            attention: backend: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
         """
-        super().__init__()
+        NetworkPolicy.__init__(
+            self, processor, config, compute_dtype=compute_dtype, history_dtype=history_dtype, augment=augment
+        )
         self.backbone, self.memory, self.integration = backbone, memory, integration
-        self.processor = processor
-        self.config = dict(config or {})
-        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.augment = augment
-        backbone.choose_attention(attention)
-        if memory is not None:
-            memory.choose_products(checked_products(float32_products))
+        self._set_backends(attention, checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
-        self.sample_steps = backbone.sample_steps
-        self.agrees = backbone.agrees
-        self.adapted, self.heads, self.unadaptable = backbone.adapted, backbone.heads, backbone.unadaptable
+        if isinstance(backbone, HasFlowHead):
+            self.sample_steps, self.supports_rtc = backbone.head.steps, True
+
+    def _set_backends(self, attention: str, float32_products: str) -> None:
+        if isinstance(self.backbone, HasAttentionBackends):
+            self.backbone.set_attention_backend(attention)
+        elif check_backend(attention) != "auto":
+            raise UserError(
+                f"policy.attention={attention}: {type(self.backbone).__name__} has one attention backend; leave it at "
+                "auto."
+            )
+        for module in self.modules():
+            if isinstance(module, MatmulPrecision):
+                module.float32_products = float32_products
 
     @classmethod
     def from_config(
@@ -96,52 +104,44 @@ class MMEPolicy(Policy):
     ) -> Self:
         """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a registry's key.
 
-        With `fresh_backbone=False` no weight of the backbone itself is drawn: a checkpoint is to be loaded.
+        With `fresh_backbone=False` no weight of the backbone itself is initialised: a checkpoint is loaded next.
 
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
         """
         backbone_cls, sizes = read_backbone(config["backbone"])
-        embodiment_of(config)  # a robot that does not fit is told before anything is built
-        chosen = config.get("integration")
-        if chosen and (unhosted := doors_of(INTEGRATIONS[chosen.get("name")]) - backbone_cls.hosts):
+        embodiment_of(config)  # raises an error before anything is built
+        section = config.get("integration")
+        if section and (unsupported := extension_points(INTEGRATIONS[section.get("name")]) - backbone_cls.supports):
             raise UserError(
-                f"The backbone {config['backbone']['name']!r} has no place for {listed(sorted(unhosted))} of the "
-                f"integration {chosen['name']!r}; it hosts {listed(sorted(backbone_cls.hosts))}. Choose another "
+                f"The backbone {config['backbone']['name']!r} has no place for {listed(sorted(unsupported))} of the "
+                f"integration {section['name']!r}; it hosts {listed(sorted(backbone_cls.supports))}. Choose another "
                 "integration or backbone."
             )
-        integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
+        integration: Integration = INTEGRATIONS.build(section, sizes) if section else Integration(sizes)
         experts = integration.extra_experts()
         with nullcontext() if fresh_backbone else shapes_only():
             backbone = backbone_cls(sizes, experts)
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())
-            backbone.draw_experts(list(experts))
-        memory: Memory | None = None
+            if isinstance(backbone, HasExtraExperts):
+                backbone.init_experts(list(experts))
+        memory: MemoryModule | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
-        check_integrated(config, integration, memory, backbone_cls.hosts)
+        check_integrated(config, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
-
-    def autocast(self) -> torch.autocast:
-        """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
-        return self.backbone.loss_draws(count, generator)
-
-    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """While training with augmentation `changes` [n, …]: what happens to a sample's pictures."""
-        return {"changes": self._draw_changes(count, generator)} if self.training and self.augment else {}
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
+        """While training with augmentation `changes` [n, …]: random numbers that change a sample's images."""
+        return {"changes": self._sample_augmentation(count, generator)} if self.training and self.augment else {}
 
     def forward(
         self,
         batch: Batch,
-        draws: Mapping[str, Tensor] | Tensor | None = None,
+        noise: Mapping[str, Tensor] | Tensor | None = None,
         time: Tensor | None = None,
         memory: MemoryTokens | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -149,100 +149,70 @@ class MMEPolicy(Policy):
 
         Args:
             batch: with `actions`.
-            draws: as `loss_draws` makes them; of a flow also its noise [b, h, a] alone, with the times beside it.
-            time: flow times [b], where `draws` is the noise.
-            memory: memory tokens encoded beforehand; by default they are made from `batch.history`.
+            noise: as `training_noise` makes it; of a flow also its noise [b, h, a] alone, with the times beside it.
+            time: flow times [b], if `noise` is a tensor.
+            memory: memory tokens; by default those of `batch.history`.
 
         Returns:
-            The loss and its metrics; the memory's own begin with `memory/` and are there while `memory.reporting`.
+            The loss and its metrics; the memory's own begin with `memory/` and are present while `memory.reporting`.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        given = named_draws(draws, time=time)
-        if set(self.loss_draws(0, torch.default_generator)) - set(given):
-            given = self.loss_draws(len(batch.actions), torch.default_generator) | given
-        if "changes" not in given:
-            given = given | self.picture_draws(len(batch.actions), torch.default_generator)
-        drawn = map_draws(given, lambda value: value.to(self.device))
-        batch, views = self._seen(batch, drawn.pop("changes", None))
-        with self.autocast():
-            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            losses = self.backbone.loss(batch, views, self._inject(memory), drawn)  # b h
-        loss = masked_mean(losses, batch.action_mask)
+        values = named_noise(noise, time=time)
+        if set(self.training_noise(0, torch.default_generator)) - set(values):
+            values = self.training_noise(len(batch.actions), torch.default_generator) | values
+        if "changes" not in values:
+            values = values | self.augmentation_params(len(batch.actions), torch.default_generator)
+        values = map_noise(values, lambda value: value.to(self.device))
+        augmentation = values.pop("changes", None)
+        if memory is None:
+            with self.autocast():
+                memory = self.encode_memory(self.conditioned_history(batch))
+        loss = self.loss(batch, values, memory, augmentation)
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
         with self.autocast():
-            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            return self.backbone.velocity(*self._seen(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
+            memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            injection = self.inject(self.prepare_images(batch), memory)
+            return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
 
-    def recompute(self, wanted: Recompute) -> None:
-        """Compute activations again in the backward pass instead of keeping them, or keep them."""
-        self.backbone.recompute(wanted)
+    def recompute(self, mode: Recompute) -> None:
+        if not isinstance(self.backbone, Recomputes):
+            raise UserError(
+                f"train.recompute: {type(self.backbone).__name__} does not inherit from `Recomputes` "
+                "(mme_vla.speed). Set train.recompute=false."
+            )
+        self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
-        """Compile the backbone's tower and layers in place, each by itself, and what of the memory is worth it."""
+        """Compile the backbone's tower and layers in place, each by itself, and the recurrence of a memory."""
         self.backbone.compile(**options)
-        if self.memory is not None:
+        if isinstance(self.memory, CompilableMemory):
             self.memory.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The backbone's groups. Memory and integration stand in none: they are small, and compute in float32."""
-        return self.backbone.shard_groups()
+        """The backbone's groups. Memory and integration are in none: they are small, and compute in float32."""
+        return self.backbone.shard_groups() if isinstance(self.backbone, Sharded) else backbone_groups(self.backbone)
 
-    def _inject(self, memory: MemoryTokens | None) -> Inject:
-        return lambda observation: self.integration.inject(observation, memory)
-
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Memory tokens of a selection, or None for a policy without memory."""
-        if self.memory is None or history is None:
-            return None
-        return self.memory(history)
-
-    def _marked(self, batch: Batch) -> HistoryTokens | None:
-        """The batch's selection as the backbone reads it beside the prompt."""
-        if self.memory is None or batch.history is None:
-            return None
-        mark = partial(self.backbone.mark, prompt=batch.prompt, prompt_mask=batch.prompt_mask)
-        return self.memory.marked(batch.history, mark)
-
-    def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
-        """The random numbers that change the pictures of `count` training samples, [count, …] on the CPU."""
-        from mme_vla.processing.augment import augmentation_draws
-
+    def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
+        """Random numbers of the augmentation of `count` training samples, [count, …] on the CPU."""
         return augmentation_draws(count, generator)
 
-    def _seen(self, batch: Batch, changes: Tensor | None = None) -> tuple[Batch, Tensor]:
-        """The batch and its current views as the backbone takes them; past ones are changed as the current ones are."""
-        views = self._views(batch, changes)
-        if batch.past is None:
-            return batch, views
-        count = batch.past.images.shape[1]
-        each = replace(batch, images=batch.past.images.flatten(0, 1), past=None)
-        past = self._views(each, None if changes is None else changes.repeat_interleave(count, 0))
-        return replace(batch, past=replace(batch.past, images=past.unflatten(0, (-1, count)))), views
-
-    def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
-        """The current views in [−1, 1], changed where random numbers say how (`_draw_changes`)."""
-        from mme_vla.processing.augment import augment_views
-        from mme_vla.processing.pictures import to_unit_range
-
-        images = to_unit_range(batch.images)
-        return images if changes is None else augment_views(images, self.embodiment.augmentations, changes)
+    def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
+        """Views in [−1, 1], augmented as the cameras of the embodiment say."""
+        unit = super().transform_images(images, None)
+        return unit if augmentation is None else augment_views(unit, self.embodiment.augmentations, augmentation)
 
     # Sampling
-
-    def sample_draws(self, generator: torch.Generator) -> Draws:
-        """What one chunk of the backbone draws: of π0.5 the starting `noise` [h, a]."""
-        return self.backbone.sample_draws(generator)
 
     @torch.no_grad()
     def sample_actions(
         self,
         batch: Batch,
-        draws: Mapping[str, Tensor] | Tensor | None = None,
+        noise: Mapping[str, Tensor] | Tensor | None = None,
         steps: int | None = None,
         generator: torch.Generator | None = None,
         memory: MemoryTokens | None = None,
@@ -250,38 +220,32 @@ class MMEPolicy(Policy):
         """A normalised chunk [b, h, a].
 
         Args:
-            draws: as `sample_draws` makes them, with a batch axis; of a flow also its noise [b, h, a] alone.
+            noise: as `sampling_noise` makes it, with a batch axis; of a flow also its noise [b, h, a] alone.
             steps: Euler steps of a flow; 10 by default, as released.
-            generator: where fresh draws come from (on the CPU). memory: memory tokens encoded beforehand.
+            generator: source of new noise, on the CPU. memory: memory tokens; by default those of `batch.history`.
         """
-        if draws is None:
+        if noise is None:
             source = torch.default_generator if generator is None else generator
-            draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
-        drawn = map_draws(named_draws(draws), lambda value: send(value, self.device))
+            noise = stack_noise([self.sampling_noise(source) for _ in range(len(batch.prompt))])
+        values = map_noise(named_noise(noise), lambda value: send(value, self.device))
+        # Real-time chunking also runs the network backwards, which a graph does not contain.
+        if self._sampler is None or self.training or batch.overlap is not None:
+            return self.sample(batch, values, steps, memory)
         if memory is None:
             with self.autocast():
-                memory = self.encode_memory(self._marked(batch))
-        # A chunk that agrees with promised actions runs the network backwards as well: no graph is made of that.
-        if self._sampler is not None and not self.training and batch.overlap is None:
-            return self._sampler(batch, memory, drawn, steps or self.sample_steps)
-        return self._sample(batch, memory, drawn, steps)
-
-    def _sample(
-        self, batch: Batch, memory: MemoryTokens | None, drawn: Mapping[str, Tensor], steps: int | None
-    ) -> Tensor:
-        with self.autocast():
-            return self.backbone.sample(*self._seen(batch), self._inject(memory), drawn, steps)
+                memory = self.encode_memory(self.conditioned_history(batch))
+        return self._sampler(batch, memory, values, steps or self.sample_steps)
 
     @property
     def compiles_sampling(self) -> bool:
-        """Whether its backbone's sampler can be compiled."""
-        return self.backbone.compiles_sampling
+        """Whether the backbone's sampler can be compiled."""
+        return isinstance(self.backbone, CapturableSampling)
 
     def compile_sampling(self, layers: bool = False) -> None:
-        """Make chunks quick, for a policy whose weights are done: they are the same to the rounding of their kernels.
+        """Speed up sampling with fixed weights; chunks are equal up to the rounding of other kernels.
 
         What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one CUDA graph for each
-        size of batch, captured when it first occurs; here for one episode and every length of prompt.
+        batch size, captured when it first occurs; here for one episode and every length of prompt.
 
         Args:
             layers: compile the tower and the layers too, which takes a minute or more at full size.
@@ -289,6 +253,11 @@ class MMEPolicy(Policy):
         Raises:
             UserError: this backbone has no sampler that can be captured.
         """
+        if not isinstance(self.backbone, CapturableSampling):
+            raise UserError(
+                f"The backbone {type(self.backbone).__name__} has no sampler that can be compiled: leave "
+                "sampling=eager."
+            )
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
@@ -302,47 +271,52 @@ class MMEPolicy(Policy):
             cut = replace(full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length])
             self.sample_actions(cut)
 
+    def _sample(self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int) -> Tensor:
+        return self.sample(batch, noise, steps, memory)
+
     # Episodes
 
     def observation(self, episodes: Sequence[Episode]) -> Batch:
         """The current views and prompts of running episodes."""
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
         states = torch.stack([e.state for e in episodes])
-        promises = [e.promised for e in episodes]
+        prefixes = [e.action_prefix for e in episodes]
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),
             image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
             state=states,
-            overlap=promised_overlap(promises, states, self.require_processor(), self.action_dim),
+            overlap=prefix_overlap(prefixes, states, self.require_processor(), self.action_dim),
             past=stack_past([e.past for e in episodes]),
         )
         return batch.without_prompt_padding().sent(self.device)
 
-    def answer(
-        self, batch: Batch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+    def predict_chunk(
+        self, batch: Batch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        """A chunk for what `observation` saw, through the episodes' memories."""
-        return self.sample_actions(batch, draws, steps, memory=self._remember(episodes, batch))
+        """A chunk for the batch of `observation`, with the episodes' memories."""
+        return self.sample_actions(batch, noise, steps, memory=self._memory_tokens(episodes, batch))
 
     @torch.no_grad()
-    def _remember(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
-        """Memory tokens of running episodes, through what their streams have already taken."""
+    def _memory_tokens(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
+        """Memory tokens of running episodes, from the states of their streams."""
         if self.memory is None:
             return None
         with self.autocast():
             histories = [
-                MarkedHistory(e.required_history(), partial(self._mark_one, batch.prompt[i], batch.prompt_mask[i]))
+                PromptConditionedHistory(
+                    e.required_history(), partial(self._condition_one, batch.prompt[i], batch.prompt_mask[i])
+                )
                 for i, e in enumerate(episodes)
             ]
             for episode, history in zip(episodes, histories, strict=True):
                 episode.read = history
-            return self.memory.encode(histories, [e.stream for e in episodes])
+            return encode_histories(self.memory, histories, [e.stream for e in episodes])
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
-        if self.memory is None or episode.read is None:
+        if not isinstance(self.memory, StreamingMemory) or episode.read is None:
             return False
         with self.autocast():
             return self.memory.prepare(episode.read, episode.stream)
@@ -351,18 +325,16 @@ class MMEPolicy(Policy):
         """What the memory reads; nothing without one."""
         return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
 
-    def _mark_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
-        """Stored tokens [n, d_vision] of one episode, read beside its prompt [l]."""
-        return self.backbone.mark(tokens[None], prompt[None], prompt_mask[None])[0]
+    def _condition_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
+        """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
+        return self.backbone.condition_on_prompt(tokens[None], prompt[None], prompt_mask[None])[0]
 
-    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
-        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        return encode_frames(self, frames, self.backbone.pooled_tokens, self.backbone.vision_width, batch_size)
+    @property
+    def memory_tower(self) -> MemoryTower:
+        return MemoryTower(self.backbone.vision, self._pooled_tokens, self.backbone.vision_width)
 
-    def vision_fingerprint(self) -> str:
-        """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        pictures = "" if self.processor is None else self.processor.memory_pictures
-        return tower_fingerprint(self.backbone.vision, self.compute_dtype, pictures)
+    def _pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
+        return pool_grid(self.backbone.encode_images(images), grid, pooling)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""
@@ -372,47 +344,42 @@ class MMEPolicy(Policy):
             image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
             prompt=torch.full((1, length), 5, device=device),
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
-            history=None if self.memory is None else self.memory.full_history(self.backbone.vision_width, device),
+            history=None if self.memory is None else full_history(self.memory, self.backbone.vision_width, device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            past=None if self.memory is None else full_past(self.memory.looks_back, views, size, device),
+            past=full_past(past_view_spec(self.memory), views, size, device),
         )
 
     def _prompt_length(self) -> int:
         return int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
 
-    def see_empty_frame(self) -> None:
-        """Run the vision tower on one black memory frame."""
+    def warm_up_vision(self) -> None:
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         processor = self.require_processor()
-        for name in ("image_size", "action_dim", "horizon"):
-            found, expected = getattr(processor, name), getattr(self.backbone, name)
-            if found != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
-                    "two checkpoints, or one was changed."
-                )
+        sizes = {
+            name: (getattr(processor, name), getattr(self.backbone, name)) for name in ("image_size", "action_dim")
+        }
+        return {**sizes, "horizon": (processor.embodiment.action.horizon, self.backbone.horizon)}
 
-    def parts(self) -> Mapping[str, str]:
-        """The backbone's parts in its order; memory, integration and the latter's experts are the part `memory`."""
-        parts = {part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items()}
-        experts = f"|{parts['memory']}" if "memory" in parts else ""
-        return {**parts, "memory": rf"memory\.|integration\.{experts}"}
+    @property
+    def finetune_spec(self) -> FineTuneSpec:
+        """The backbone's components in its order; memory, integration and its experts are the component `memory`."""
+        backbone = self.backbone
+        components = {name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()}
+        experts = f"|{components['memory']}" if "memory" in components else ""
+        components["memory"] = rf"memory\.|integration\.{experts}"
+        if not isinstance(backbone, HasLoraTargets):
+            return FineTuneSpec(components)
+        return FineTuneSpec(components, backbone.lora_targets, backbone.heads, backbone.lora_exclude)
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:
-    """The policy, where it is made of backbone, memory and integration.
-
-    Raises:
-        UserError: it is of another kind; `what` says what cannot be done with it.
-    """
+    """The policy, where it is made of backbone, memory and integration."""
     if not isinstance(policy, MMEPolicy):
         raise UserError(
-            f"{what} looks inside a backbone that a memory is integrated with; {policy.config.get('name', 'this')} is "
-            f"a {type(policy).__name__}, which has none."
+            f"{what} requires a policy of backbone, memory and integration; "
+            f"{policy.config.get('name', 'this')} is a {type(policy).__name__}."
         )
     return policy

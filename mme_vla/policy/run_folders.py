@@ -14,8 +14,8 @@ _STEP = re.compile(r"step_(\d+)")
 
 def checkpoints_in(folder: Path) -> list[Path]:
     """The finished checkpoints in a `checkpoints` folder, oldest step first."""
-    found = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
-    return sorted(found, key=step_of)
+    folders = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
+    return sorted(folders, key=step_of)
 
 
 def checkpoint_name(step: int) -> str:
@@ -39,9 +39,6 @@ def find_run(path: Path) -> Path:
     """`path`, the newest run where it ends in `latest`, or the shipped checkpoint where it is `nano`.
 
     A file or folder of that name goes first.
-
-    Raises:
-        UserError: `latest`, and there is no run with a checkpoint beside it.
     """
     if path.exists():
         return path
@@ -61,17 +58,14 @@ def resolve_checkpoint(path: Path) -> Path:
     """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
 
     A path that ends in `latest` means the newest run of its folder, and `nano` the shipped checkpoint.
-
-    Raises:
-        UserError: there is no checkpoint.
     """
-    found = newest_checkpoint(path)
-    if found != path or (path / "config.json").is_file():
-        return found
+    newest = newest_checkpoint(path)
+    if newest != path or (path / "config.json").is_file():
+        return newest
     if _is_released(path):
         raise UserError(
             f"{path} is a checkpoint of the released code, in another format. Convert it, then name the new folder: "
-            f"python -m mme_vla.weights.convert {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
+            f"mme-vla weights {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
             "where no history_config.txt names the variant)."
         )
     raise UserError(
@@ -87,21 +81,13 @@ def _is_released(path: Path) -> bool:
 
 
 def newest_checkpoint(path: Path) -> Path:
-    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself.
-
-    Raises:
-        UserError: `latest`, and there is no run with a checkpoint beside it.
-    """
+    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself."""
     path = find_run(path)
-    found = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
-    return found[-1] if found else path
+    checkpoints = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
+    return checkpoints[-1] if checkpoints else path
 
 
 def locate_checkpoint(source: str | Path) -> str:
-    """The checkpoint folder that `source` names; `source` itself where it is none on this machine, but on the hub.
-
-    Raises:
-        UserError: a folder without a checkpoint.
-    """
+    """The checkpoint folder that `source` names; `source` itself where it is none on this machine, but on the hub."""
     path = find_run(Path(source).expanduser())
     return str(resolve_checkpoint(path)) if path.exists() else str(source)

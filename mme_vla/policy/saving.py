@@ -1,226 +1,325 @@
-"""What a policy needs to write itself to a folder or the hub, and to come back."""
+"""Save a policy to a folder or the hub, and load it."""
 
+import inspect
 import json
+import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from mme_vla.backbone.shapes_only import shapes_only
+from mme_vla.backbone.config import shapes_only
+from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
 from mme_vla.config.plugins import import_trusted
-from mme_vla.errors import UserError, brief
-from mme_vla.files import check_sums, inside, read_json, write_sums
+from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.policy.capabilities import ComparesSizes
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
-from mme_vla.policy.hub import local_folder, push_folder
-from mme_vla.policy.kinds import policy_class_for
-from mme_vla.policy.tensor_files import assign_tensors, dtype_of, load_tensors, save_tensors, written_weights
+from mme_vla.policy.run_folders import newest_checkpoint
+from mme_vla.policy.tensor_files import assign_tensors, dtype_of, list_weight_files, load_tensors, save_tensors
+from mme_vla.registry import POLICIES
+from mme_vla.utils import check_sums, inside, read_json, write_sums
 
 if TYPE_CHECKING:
-    from mme_vla.processing.base import PolicyProcessor
+    from mme_vla.policy.base import Policy
+
+
+def composition_digest(config: Mapping[str, Any]) -> str:
+    """Twelve letters that are equal for two policies exactly if they are composed alike, sizes included.
+
+    Args:
+        config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was trained on and in
+            which precision it computes do not count; nor do keys that are not set, so that a later option with an
+            empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
+    """
+    settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(config.get("policy") or {})
+    settings = {key: value for key, value in settings.items() if value is not None and key != "processor.tokenizer"}
+    robot = embodiment_of(config)
+    if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
+        settings |= flat({"embodiment": robot.to_dict()})
+    return digest(settings, 12)
+
+
+DEFAULT = "mme"
+"""The policy of configurations that name none: backbone × memory × integration."""
+
+
+def policy_name(config: Mapping[str, Any]) -> str:
+    """What the section `policy` of a configuration calls its class."""
+    section = config.get("policy") or {}
+    if not isinstance(section, Mapping):
+        raise UserError(f"policy={brief(section)} must be a section.")
+    return section.get("name", DEFAULT)  # the registry refuses what is no name
+
+
+def policy_class(config: Mapping[str, Any]) -> type[Any]:
+    """The class of the policy that a configuration describes."""
+    kind: type[Any] = POLICIES[policy_name(config)]
+    return kind
+
+
+def policy_class_for[P](requested: type[P], config: Mapping[str, Any], source: str) -> type[P]:
+    """The class to load a checkpoint with, where `asked.from_pretrained` was called."""
+    kind = policy_class(config)
+    if issubclass(requested, kind):
+        return requested
+    if issubclass(kind, requested):
+        return kind
+    raise UserError(
+        f"{source} holds a {policy_name(config)!r} policy, which is no {requested.__name__}: load it with "
+        "Policy.from_pretrained(), which knows every kind."
+    )
+
+
+def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `policy`, whose keys beside `name` are the constructor's keyword-only arguments.
+
+    Where a constructor takes `**options`, those of its parent class count too.
+    """
+    options = {key: value for key, value in config.get("policy", {}).items() if key != "name"}
+    known = _keyword_options(cls)
+    for key in options:
+        if key not in known:
+            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
+    return options
+
+
+def _keyword_options(cls: type) -> list[str]:
+    known: list[str] = []
+    for owner in cls.__mro__:
+        if "__init__" in vars(owner):
+            parameters = inspect.signature(vars(owner)["__init__"]).parameters.values()
+            known += [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+                break
+    return list(dict.fromkeys(known))
+
+
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_PLACE = re.compile(rf"({_REPOSITORY.pattern})((?:/[\w-][\w. -]*)*)")
+"""A repository, and a folder or file in it."""
+
+
+def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
+    """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of that name.
+
+    A folder of a training run means its newest checkpoint, and `latest` for the newest run beside it.
+
+    Args:
+        source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no other is fetched.
+        revision: branch, tag or commit of the repository; its main branch by default.
+        token: for private repositories; the one stored by `hf auth login` by default.
+    """
+    path = newest_checkpoint(Path(source).expanduser())
+    place = _PLACE.fullmatch(str(source))
+    if path.exists() or place is None:
+        if revision is not None:
+            raise UserError(f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
+        return path
+    import httpx
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+
+    repository, within = place[1], place[2].strip("/")
+    try:
+        if not within:
+            return Path(snapshot_download(repository, revision=revision, token=token))
+        patterns = [within, f"{within}/*"]
+        root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns))
+        if not (root / within).exists():
+            raise UserError(f"The hub repository {repository} has no {within!r}: nothing of that name was in it.")
+        return root / within
+    except (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
+        at = "" if revision is None else f" at revision {revision!r}"
+        reason = str(error).strip().splitlines()
+        raise UserError(
+            f"{source} is not a path on this machine, and the hub repository of that name{at} could not be fetched "
+            f"({type(error).__name__}: {reason[0] if reason else 'no answer'}). Check the name, the network, and for a "
+            "private or gated repository your token (hf auth login)."
+        ) from error
+
+
+def push_folder(
+    folder: Path, repo_id: str, *, private: bool, token: str | None, revision: str | None, message: str
+) -> str:
+    """Create the repository if need be, upload the folder's files as one commit, and return its address."""
+    if not _REPOSITORY.fullmatch(repo_id):
+        raise UserError(f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul.")
+    import huggingface_hub
+    from huggingface_hub.errors import HfHubHTTPError
+
+    api: Any = huggingface_hub.HfApi(token=token)
+    try:
+        address = api.create_repo(repo_id, private=private, exist_ok=True)
+        if revision is not None:
+            api.create_branch(repo_id, branch=revision, exist_ok=True)
+        api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=message, revision=revision)
+    except HfHubHTTPError as error:
+        raise UserError(f"The hub refused to store {repo_id}: {error}. Is the token allowed to write there?") from error
+    return str(address)
+
 
 CONFIG = "config.json"
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported.
-
-    Raises:
-        UserError: it is missing, damaged, or a link out of the folder.
-    """
+    """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported."""
     path = inside(folder, CONFIG)
     check_sums(folder, [CONFIG])
     config: dict[str, Any] = read_json(path, "a policy's configuration", limit=2**20)
     return config
 
 
-class Saved(nn.Module):
-    """A module that is built from a configuration and keeps a processor beside it."""
+def save_policy(
+    policy: "Policy", folder: Path, *, dtype: str = "float32", card: Mapping[str, Any] | None = None
+) -> None:
+    """Write a policy to a folder; see `Policy.save_pretrained`."""
+    kind = dtype_of(dtype)
+    if card is not None:
+        policy.config["card"] = {**policy.config.get("card", {}), **card}
+    save_tensors(policy.state_dict(), folder, dtype=kind)
+    settings = save_settings(policy, folder)
+    write_sums(folder, [*settings, *list_weight_files(folder)])  # without the card, which people edit
 
-    config: dict[str, Any]
-    processor: "PolicyProcessor | None"
-    acts_in_bfloat16: ClassVar[bool] = False
-    """Whether `dtype="auto"` rounds its weights to bfloat16 on a GPU."""
 
-    @classmethod
-    def from_config(
-        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
-    ) -> Self:
-        """Build from plain sections."""
-        raise NotImplementedError
+def save_settings(policy: "Policy", folder: Path) -> list[str]:
+    """Write all files of a checkpoint but the weights; return the names of those that get checksums."""
+    (folder / CONFIG).write_text(json.dumps(policy.config, indent=2, ensure_ascii=False) + "\n")
+    (folder / CARD_FILE).write_text(model_card(policy, policy.config))
+    return [CONFIG, *(policy.processor.save(folder) if policy.processor is not None else [])]
 
-    def save_pretrained(
-        self, folder: str | Path, *, dtype: str = "float32", card: Mapping[str, Any] | None = None
-    ) -> None:
-        """Write weights, configuration, normalisation statistics and tokenizer; `from_pretrained` needs no more.
 
-        `SHA256SUMS` beside them holds a checksum of each, which loading compares.
+def push_to_hub(
+    policy: "Policy",
+    repo_id: str,
+    *,
+    dtype: str = "float32",
+    card: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> str:
+    """Store a policy on the hub; see `Policy.push_to_hub`."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_policy(policy, Path(folder), dtype=dtype, card=card)
+        return push_folder(Path(folder), repo_id, **options)
 
-        Args:
-            dtype: what the weights are stored in: `float32`, or `bfloat16` at half the size and eight bits of mantissa.
-            card: facts for the model card, kept in the configuration: `data` (words), `recipe`, `results` (tables),
-                `license`, `base_model`, `datasets` (ids on the hub).
 
-        Raises:
-            UserError: an unknown dtype.
-        """
-        kind, folder = dtype_of(dtype), Path(folder)
-        if card is not None:
-            self.config["card"] = {**self.config.get("card", {}), **card}
-        save_tensors(self.state_dict(), folder, dtype=kind)
-        about = self.save_about(folder)
-        write_sums(folder, [*about, *written_weights(folder)])  # not of the card, which people edit
+def load_policy[P: "Policy"](
+    requested: type[P],
+    source: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    dtype: str = "float32",
+    revision: str | None = None,
+    token: str | None = None,
+    trust_plugins: bool = False,
+    tokenizer: str | Path | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> P:
+    """Load a policy of the class `requested`, or of a subclass; see `Policy.from_pretrained`.
 
-    def save_about(self, folder: Path) -> list[str]:
-        """Write all that `save_pretrained` writes beside the weights; return the names of what has checksums."""
-        (folder / CONFIG).write_text(json.dumps(self.config, indent=2, ensure_ascii=False) + "\n")
-        (folder / CARD_FILE).write_text(model_card(self, self.config))
-        return [CONFIG, *(self.processor.save(folder) if self.processor is not None else [])]
+    Args:
+        options: overrides of the section `policy`.
+    """
+    from mme_vla.processing.base import load_processor
 
-    @classmethod
-    def from_pretrained(
-        cls,
-        source: str | Path,
-        *,
-        device: str | torch.device = "cpu",
-        dtype: str = "float32",
-        revision: str | None = None,
-        token: str | None = None,
-        trust_plugins: bool = False,
-        tokenizer: str | Path | None = None,
-        **policy: Any,
-    ) -> Self:
-        """Load what `save_pretrained` wrote; of a training checkpoint, the EMA weights. No weight is drawn first.
+    target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
+    if not (folder / CONFIG).is_file():
+        raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
+    config = read_config(folder)
+    if "backbone" not in config:
+        raise UserError(
+            f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
+            "are read by mme_vla.weights.load_weights() and converted by mme-vla weights."
+        )
+    import_trusted(config, str(source), trust_plugins)
+    policy_type = policy_class_for(requested, config, str(source))
+    on_gpu = torch.device(device).type == "cuda"
+    rounds = getattr(policy_type, "acts_in_bfloat16", False)  # a network that is made for it
+    kind = target_dtype or (torch.bfloat16 if on_gpu and rounds else torch.float32)
+    settings = {"compute_dtype": "bfloat16"} if kind == torch.bfloat16 else {}
+    policy = build_saved(policy_type, config, str(folder / CONFIG), {**settings, **(options or {})})
+    assign_tensors(policy, load_tensors(folder), str(source), kind)
+    recompute_buffers(policy)
+    policy.processor = load_processor(folder, tokenizer)
+    check_processor(policy, str(source))
+    if kind == torch.bfloat16:
+        policy.requires_grad_(False)
+    return policy.to(device).eval()
 
-        `Policy.from_pretrained` loads every kind of policy, a subclass its own.
 
-        Args:
-            source: a folder on disk (of a checkpoint, or of a run: then its newest; `…/latest`: of the newest run), or
-                `owner/name` of a hub repository.
-            device: where to put the weights.
-            dtype: what the weights become. `bfloat16` halves the memory, for inference: compute is then bfloat16 too,
-                and no weight asks for a gradient. `auto`: bfloat16 on a GPU if the policy is made for it, else float32.
-            revision: branch, tag or commit of the repository. token: for private repositories.
-            trust_plugins: import the modules that the checkpoint names under `plugins`: code of whoever wrote it.
-            tokenizer: in place of the one the checkpoint names, which is fetched from the hub only if it is π0.5's own.
-            policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
+def build_saved[P: "Policy"](
+    kind: type[P], config: dict[str, Any], source: str, options: Mapping[str, Any] | None = None
+) -> P:
+    """Build what the configuration of a checkpoint describes, on meta, adapters included.
 
-        Raises:
-            UserError: no checkpoint there, one of another kind of policy, a damaged file, a name that leads out of
-                the folder, plugins that are not trusted, or weights that do not fit the configuration.
-        """
-        from mme_vla.processing.base import load_processor
+    Args:
+        config: plain sections. source: where they are from, for messages. options: overrides of the section `policy`.
+    """
+    section = config.get("policy", {})
+    if not isinstance(section, dict):
+        raise UserError(f"{source}: policy={brief(section)} must be a section.")
+    config = {**config, "policy": {**section, **(options or {})}}
+    try:
+        with shapes_only():
+            built = kind.from_config(config)
+            if config.get("adapters"):
+                add_adapters(built, **config["adapters"])
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
+    except Exception as error:
+        if config.get("plugins"):
+            raise  # it may be in the user's own code
+        reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
+        raise UserError(
+            f"{source} describes no policy that can be built ({reason}). It is damaged, or of a newer version."
+        ) from error
+    return built
 
-        wanted, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
-        if not (folder / CONFIG).is_file():
-            raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
-        config = read_config(folder)
-        if "backbone" not in config:
+
+def recompute_buffers(policy: "Policy") -> None:
+    """Compute the tensors of a policy built on meta that constructors make and no file holds.
+
+    These are buffers registered with `persistent=False`, and tensors kept as plain attributes. A module with
+    `reset_buffers()` computes its own; for the others the policy is built a second time.
+    """
+    for module in policy.modules():
+        if callable(reset := getattr(module, "reset_buffers", None)):
+            reset()
+    unsaved = [
+        (path, name)
+        for path, module in policy.named_modules()
+        for name, value in [*module.named_buffers(recurse=False), *vars(module).items()]
+        if isinstance(value, Tensor) and value.is_meta
+    ]
+    if not unsaved:
+        return
+    fresh = any(path.startswith("backbone") for path, _ in unsaved)
+    with torch.random.fork_rng(devices=[]):
+        real = type(policy).from_config(policy.config, fresh_backbone=fresh)
+    for path, name in unsaved:
+        value = getattr(real.get_submodule(path), name)
+        setattr(policy.get_submodule(path), name, value)
+
+
+def check_processor(policy: "Policy", source: str) -> None:
+    """Make sure that a policy and its processor have the same robot and sizes."""
+    processor = policy.require_processor()
+    robot = embodiment_of(policy.config)
+    if policy.config.get("embodiment") is not None and robot != processor.embodiment:
+        raise UserError(
+            f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
+            f"{brief(robot.name)}, or they describe it differently. The files are from two checkpoints, or one was "
+            "changed."
+        )
+    sizes = policy.processor_sizes() if isinstance(policy, ComparesSizes) else {}
+    for name, (actual, expected) in sizes.items():
+        if actual != expected:
             raise UserError(
-                f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
-                "are read by mme_vla.weights.load_weights() and converted by python -m mme_vla.weights.convert."
+                f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+                "from two checkpoints, or one was changed."
             )
-        import_trusted(config, str(source), trust_plugins)
-        chosen = policy_class_for(cls, config, str(source))
-        on_gpu = torch.device(device).type == "cuda"
-        kind = wanted or (torch.bfloat16 if on_gpu and chosen.acts_in_bfloat16 else torch.float32)
-        if kind == torch.bfloat16:
-            policy = {"compute_dtype": "bfloat16", **policy}
-        loaded = chosen.from_saved(config, str(folder / CONFIG), policy)
-        assign_tensors(loaded, load_tensors(folder), str(source), kind)
-        loaded.compute_unsaved()
-        loaded.processor = load_processor(folder, tokenizer)
-        loaded.check_processor(str(source))
-        if kind == torch.bfloat16:
-            loaded.requires_grad_(False)
-        return loaded.to(device).eval()
-
-    @classmethod
-    def from_saved(cls, config: dict[str, Any], source: str, policy: Mapping[str, Any] | None = None) -> Self:
-        """Build what a checkpoint's configuration describes, on meta, adapters included.
-
-        Args:
-            config: plain sections. source: where they are from, for messages.
-            policy: overrides of its section `policy`.
-
-        Raises:
-            UserError: they describe nothing that can be built.
-        """
-        given = config.get("policy", {})
-        if not isinstance(given, dict):
-            raise UserError(f"{source}: policy={brief(given)} must be a section.")
-        config = {**config, "policy": {**given, **(policy or {})}}
-        try:
-            with shapes_only():
-                built = cls.from_config(config)
-                if config.get("adapters"):
-                    add_adapters(built, **config["adapters"])  # type: ignore[arg-type]  # whoever is saved is a Policy
-        except UserError as error:
-            raise UserError(f"{source}: {error}") from error
-        except Exception as error:
-            if config.get("plugins"):
-                raise  # it may be in the user's own code
-            reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
-            raise UserError(
-                f"{source} describes no policy that can be built ({reason}). It is damaged, or of a newer version."
-            ) from error
-        return built
-
-    def compute_unsaved(self) -> None:
-        """Give tensors that constructors compute, and no file holds, their values, where they were built on meta.
-
-        Such are buffers registered with `persistent=False`, and tensors kept as plain attributes.
-        """
-        places = [
-            (path, name)
-            for path, module in self.named_modules()
-            for name, value in [*module.named_buffers(recurse=False), *vars(module).items()]
-            if isinstance(value, Tensor) and value.is_meta
-        ]
-        if not places:
-            return
-        fresh = any(path.startswith("backbone") for path, _ in places)
-        with torch.random.fork_rng(devices=[]):
-            real = type(self).from_config(self.config, fresh_backbone=fresh)
-        for path, name in places:
-            value = getattr(real.get_submodule(path), name)
-            setattr(self.get_submodule(path), name, value)
-
-    def check_processor(self, source: str) -> None:
-        """Make sure that the network and its processor speak of the same sizes.
-
-        Raises:
-            UserError: they do not.
-        """
-        raise NotImplementedError
-
-    def push_to_hub(
-        self,
-        repo_id: str,
-        *,
-        private: bool = False,
-        token: str | None = None,
-        revision: str | None = None,
-        message: str = "Upload policy",
-        dtype: str = "float32",
-        card: Mapping[str, Any] | None = None,
-    ) -> str:
-        """Store the policy on the Hugging Face Hub, as `save_pretrained` writes it.
-
-        Args:
-            repo_id: `owner/name`; created if it does not exist. private: only if it is created now.
-            token: a write token; the one stored by `hf auth login` by default.
-            revision: the branch to commit to. message: of the commit. dtype, card: as for `save_pretrained`.
-
-        Returns:
-            The repository's address.
-
-        Raises:
-            UserError: the id is malformed, or the hub refuses.
-        """
-        with tempfile.TemporaryDirectory() as folder:
-            self.save_pretrained(folder, dtype=dtype, card=card)
-            return push_folder(Path(folder), repo_id, private=private, token=token, revision=revision, message=message)

@@ -1,4 +1,4 @@
-"""Folders of safetensors: written sharded where large; read strictly, whoever wrote them."""
+"""Folders of safetensors: large ones are sharded, and reading is strict."""
 
 import shutil
 import stat
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, listed
-from mme_vla.files import check_sums, inside, read_json
+from mme_vla.utils import check_sums, inside, read_json
 
 WEIGHTS = "model.safetensors"
 INDEX = "model.safetensors.index.json"
@@ -32,38 +32,26 @@ def save_tensors(
 
 
 def load_tensors(folder: Path) -> dict[str, Tensor]:
-    """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until used).
-
-    Raises:
-        UserError: no weights there, or a file that is missing, damaged, outside of the folder or not safetensors.
-    """
+    """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until used)."""
     return read_files(folder, weight_files(folder))
 
 
 def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
-    """Read safetensors files of a folder as one table, each compared with its checksum where there is one.
-
-    Raises:
-        UserError: a file that is missing, damaged or not safetensors, or a tensor that stands in two of them.
-    """
+    """Read safetensors files of a folder as one table, each compared with its checksum where there is one."""
     files = list(files)
     check_sums(folder, [file.relative_to(folder).as_posix() for file in files])
     tensors: dict[str, Tensor] = {}
     for file in files:
-        found = read_safetensors(file)
-        twice = sorted(set(found) & set(tensors))
+        loaded = read_safetensors(file)
+        twice = sorted(set(loaded) & set(tensors))
         if twice:
             raise UserError(f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.")
-        tensors |= found
+        tensors |= loaded
     return tensors
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """The safetensors files that hold a folder's weights.
-
-    Raises:
-        UserError: there are none, or the index is damaged or names files outside of the folder.
-    """
+    """The safetensors files that hold a folder's weights."""
     if (folder / INDEX).is_file():
         check_sums(folder, [INDEX])
         table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
@@ -76,17 +64,12 @@ def weight_files(folder: Path) -> list[Path]:
     raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
 
 
-def written_weights(folder: Path) -> list[str]:
+def list_weight_files(folder: Path) -> list[str]:
     """The names of a folder's weights and of their index."""
     return [*(INDEX for _ in folder.glob(INDEX)), *(file.name for file in weight_files(folder))]
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:
-    """Read one safetensors file.
-
-    Raises:
-        UserError: it is missing, cut short or something else.
-    """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -100,11 +83,7 @@ def read_safetensors(file: Path) -> dict[str, Tensor]:
 
 
 def check_header(file: Path) -> None:
-    """Make sure that a safetensors file is one, and that its header is of a size worth parsing.
-
-    Raises:
-        UserError: it is missing, a folder, a device or a pipe, or its header cannot be one.
-    """
+    """Make sure that a safetensors file is one, and that its header is of a size worth parsing."""
     try:
         about = file.stat()
         if not stat.S_ISREG(about.st_mode):
@@ -112,8 +91,8 @@ def check_header(file: Path) -> None:
         with file.open("rb") as opened:
             header = int.from_bytes(opened.read(8), "little")
     except OSError as error:
-        shown = brief(str(file), 300, quote=False)  # an index may give a name of any length
-        raise UserError(f"{shown} cannot be read as a safetensors file: {error.strerror or error}.") from None
+        label = brief(str(file), 300, quote=False)  # an index may give a name of any length
+        raise UserError(f"{label} cannot be read as a safetensors file: {error.strerror or error}.") from None
     if header > min(_HEADER_LIMIT, about.st_size - 8):
         raise UserError(
             f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "
@@ -127,33 +106,24 @@ def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
 
 
 def dtype_of(name: str, what: str = "dtype") -> torch.dtype:
-    """Look up `float32` or `bfloat16`.
-
-    Raises:
-        UserError: another name.
-    """
+    """Look up `float32` or `bfloat16`."""
     if not isinstance(name, str) or name not in DTYPES:
         raise UserError(f"{what}={brief(name)}: choose one of {', '.join(DTYPES)}.")
     return DTYPES[name]
 
 
 def check_fit(
-    found: Mapping[str, Tensor],
+    tensors: Mapping[str, Tensor],
     expected: Mapping[str, tuple[int, ...]],
     source: str,
     optional: Collection[str] = (),
 ) -> None:
-    """Compare names and shapes.
-
-    Raises:
-        UserError: lists the tensors that are missing (and not `optional`), left over or misshapen; of many, the first.
-    """
-    missing = sorted(set(expected) - set(found) - set(optional))
-    unexpected = sorted(set(found) - set(expected))
+    missing = sorted(set(expected) - set(tensors) - set(optional))
+    unexpected = sorted(set(tensors) - set(expected))
     misshapen = [
-        f"{name}: {tuple(found[name].shape)} instead of {tuple(expected[name])}"
-        for name in sorted(set(expected) & set(found))
-        if tuple(found[name].shape) != tuple(expected[name])
+        f"{name}: {tuple(tensors[name].shape)} instead of {tuple(expected[name])}"
+        for name in sorted(set(expected) & set(tensors))
+        if tuple(tensors[name].shape) != tuple(expected[name])
     ]
     problems = [
         f"{len(names):,} {what}:\n  {listed(names, 5)}"
@@ -165,11 +135,7 @@ def check_fit(
 
 
 def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Make sure that tensors hold numbers a network can compute with.
-
-    Raises:
-        UserError: names the tensors that hold NaN or infinities.
-    """
+    """Make sure that tensors hold numbers a network can compute with."""
     broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
     if broken:
         raise UserError(
@@ -184,14 +150,10 @@ def assign_tensors(
     """Give a module (on meta or not) these tensors as its parameters; nothing may be missing, left over or misshapen.
 
     `dtype` is what floating-point tensors are brought to; by default each keeps its own.
-
-    Raises:
-        UserError: lists the tensors that do not fit, are of another kind of number, or hold NaN, before anything is
-            changed.
     """
-    own = module.state_dict()
-    check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in own.items()}, source)
-    check_kinds(tensors, own, source)
+    state = module.state_dict()
+    check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in state.items()}, source)
+    check_kinds(tensors, state, source)
     check_values(tensors, source)
     trainable = {name: p.requires_grad for name, p in module.named_parameters()}
     module.load_state_dict({name: cast(t, dtype) for name, t in tensors.items()}, strict=True, assign=True)
@@ -202,7 +164,7 @@ def assign_tensors(
 def take_memory(module: nn.Module) -> None:
     """Move those of a module's tensors that lie in a memory-mapped file into memory that torch allots.
 
-    Files place tensors at any multiple of a few bytes, and matrix products round differently from there: what goes on
+    Files place tensors at any multiple of a few bytes, and matrix products round differently from there: what continues
     from a file would differ in the last bits from what never stopped.
     """
     for tensor in (*module.parameters(), *module.buffers()):
@@ -210,16 +172,13 @@ def take_memory(module: nn.Module) -> None:
             tensor.data = tensor.data.clone()
 
 
-def check_kinds(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], source: str) -> None:
-    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are.
-
-    Raises:
-        UserError: names the tensors that are not.
-    """
+def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: str) -> None:
+    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are."""
     wrong = [
-        f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of {str(own[name].dtype).removeprefix('torch.')}"
+        f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of "
+        f"{str(expected[name].dtype).removeprefix('torch.')}"
         for name, tensor in tensors.items()
-        if name in own and _kind(tensor) != _kind(own[name])
+        if name in expected and _kind(tensor) != _kind(expected[name])
     ]
     if wrong:
         raise UserError(f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.")

@@ -1,20 +1,24 @@
-"""What every processor is asked: pictures, words, states and actions in the network's form, batches, and back."""
+"""`PolicyProcessor`: the interface between raw data and one kind of network."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
-from mme_vla.files import check_sums, inside, read_json
-from mme_vla.processing.normalisers import NormStats, normalize
+from mme_vla.memory.base import stack_history
+from mme_vla.processing.images import stack_past
+from mme_vla.processing.normalise import NormStats, normalize
 from mme_vla.registry import PROCESSORS
+from mme_vla.types import Batch
+from mme_vla.utils import check_sums, inside, read_json
 
 CONFIG_FILE = "processor.json"
 STATS_FILE = "norm_stats.json"
@@ -24,9 +28,9 @@ DEFAULT = "pi05"
 
 @dataclass(frozen=True)
 class Sample:
-    """One training step as it is recorded, with the frames before it that the processor asked for.
+    """One training step as it is recorded, with the frames of the window before it.
 
-    views: camera → pictures [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
+    views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
     goal: the task in words; subgoal: its current part, where the policy reads one.
     past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk, absolute.
     """
@@ -40,14 +44,50 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Counted:
-    """What normalisation statistics are made of.
+class SampleSpec:
+    """What a training sample and an observation consist of.
 
-    horizon: chunk steps of each observation that count, relative where the embodiment says so; None for the chunk's.
-    every: every execution step once, in the data's order; else in shuffled batches of which an incomplete last one is
-        left out, as the released code of π0.5 does.
-    extremes: keep the smallest and the largest value too. exact: quantiles of all rows at once, not of their histogram.
-    video: the conditioning video's steps count as well.
+    kind: `steps` of an execution, or `keyframes` with depth.
+    window: frames of an observation, the current one last; before the episode's start its first frame is repeated.
+    consecutive: the frames of the window follow each other; else they are those at which the policy acted.
+    full_chunks_only: leave out steps with fewer recorded actions ahead than a chunk has.
+    group_size: steps of one episode in a sample; more than 1 for policies that train on sequences.
+    cameras: whose images an item holds, in the embodiment's order; None for all.
+    """
+
+    kind: str = "steps"
+    window: int = 1
+    consecutive: bool = True
+    full_chunks_only: bool = False
+    group_size: int = 1
+    cameras: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class PromptSpec:
+    """What a processor's prompts consist of.
+
+    encoder: what turns text into numbers, for reports. name: of the prompt format, for messages.
+    reads_subgoal: whether the prompt has a subgoal. past_actions: executed actions in it.
+    fingerprint: equal for two processors only if text means the same numbers to both; None if that needs no check.
+    """
+
+    encoder: str
+    name: str = "plain"
+    reads_subgoal: bool = False
+    past_actions: int = 0
+    fingerprint: str | None = None
+
+
+@dataclass(frozen=True)
+class StatsSpec:
+    """What normalisation statistics are computed from.
+
+    horizon: chunk steps of each observation, relative if the embodiment says so; None for the full chunk.
+    every: every execution step once, in the data's order; else shuffled batches without an incomplete last one, as the
+        released code of π0.5 does.
+    extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a histogram.
+    video: include the steps of the conditioning video.
     """
 
     horizon: int | None = None
@@ -58,52 +98,21 @@ class Counted:
 
 
 class PolicyProcessor:
-    """Everything between raw data and one kind of policy's network, saved with every checkpoint.
+    """Everything between raw data and one kind of network, saved with every checkpoint.
 
-    Training, evaluation and serving share one such object, so they cannot differ. A subclass registers in `PROCESSORS`,
-    sets `embodiment` (then `stats`), and implements what raises NotImplementedError.
+    Training, evaluation and serving share it. A subclass registers in `PROCESSORS`, sets `embodiment` (then `stats`),
+    and implements what raises NotImplementedError.
     """
 
     embodiment: Embodiment
-    window: int = 1
-    """Frames an observation consists of, the current one last; clamped at the episode's start."""
-    full_chunks_only: bool = False
-    """Whether steps with fewer recorded actions ahead of them than a chunk has are left out of training."""
-    group_size: int = 1
-    """Steps of one episode that a training sample holds: more than 1 for policies that are trained on sequences."""
-    consecutive: bool = True
-    """Whether the frames of the window follow each other in an episode; else they are those at which it was asked."""
-    prompt_name: str = "plain"
-    """How the goal becomes words, for messages."""
-    counted: Counted = Counted()
-    samples: str = "steps"
-    """What a training sample is: `steps` of an execution, or `keyframes` with depth."""
+    samples: SampleSpec = SampleSpec()
+    stats_spec: StatsSpec = StatsSpec()
     _stats: NormStats | None = None
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
         """Build the processor of a composed configuration, at its backbone's sizes."""
         raise NotImplementedError
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """The cameras whose pictures an item is made of, in the embodiment's order."""
-        return self.embodiment.camera_names
-
-    @property
-    def reads_subgoal(self) -> bool:
-        """Whether the words of an observation hold a subgoal."""
-        return False
-
-    @property
-    def past_actions(self) -> int:
-        """Executed actions that the words of an observation hold."""
-        return 0
-
-    @property
-    def horizon(self) -> int:
-        """h; steps in a chunk."""
-        return self.embodiment.action.horizon
 
     @property
     def stats(self) -> NormStats | None:
@@ -121,26 +130,27 @@ class PolicyProcessor:
         self._stats = stats
 
     def require_stats(self) -> NormStats:
-        """Return the statistics, or say where they come from."""
+        """Return the statistics, or raise a `UserError`."""
         if self._stats is None:
             raise UserError(
                 "States and actions need normalisation statistics, and this processor has none. Training computes them "
-                "from its data; otherwise set processor.stats to a norm_stats.json (one stands in every checkpoint)."
+                "from its data; otherwise set processor.stats to a norm_stats.json (one is in every checkpoint)."
             )
         return self._stats
 
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Pictures of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the network takes them.
+        """Images of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the network takes them.
 
         Returns:
             uint8 [v, 3, s, s'], or [n, v, 3, s, s'].
         """
         raise NotImplementedError
 
-    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
-        """Memory frames [n, H, W, 3] uint8 as the vision tower takes them, on `device` if one is given."""
+    @property
+    def prompt_spec(self) -> PromptSpec:
+        """What the prompts consist of."""
         raise NotImplementedError
 
     def prompt(
@@ -150,62 +160,23 @@ class PolicyProcessor:
         state: np.ndarray | Tensor | None = None,
         past_actions: np.ndarray | Tensor | None = None,
     ) -> Any:
-        """What the network reads of the words, in a form of the processor's own, without a batch axis."""
+        """Encode the text as the network reads it, without a batch axis."""
         raise NotImplementedError
-
-    @property
-    def words_from(self) -> str:
-        """What turns words into numbers, for reports."""
-        raise NotImplementedError
-
-    @property
-    def memory_pictures(self) -> str:
-        """What a setting lets memory pictures go through besides, which a cache of their tokens depends on."""
-        return ""
-
-    @property
-    def words_fingerprint(self) -> str | None:
-        """Equal for two processors exactly if words mean the same numbers to both; None where that needs no check."""
-        return None
 
     # Actions
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        """Recorded actions [h, w] at a raw state [s] as the network should answer."""
+        """Recorded actions [h, w] at a raw state [s] as targets of the network."""
         raise NotImplementedError
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """The network's answer [..., h, a] at raw states [..., s] as actions [..., h, w] that the robot takes."""
+        """The network's chunk [..., h, a] at raw states [..., s] as actions [..., h, w] that the robot executes."""
         raise NotImplementedError
-
-    def motion(self, states: np.ndarray, actions: np.ndarray, known: np.ndarray) -> Tensor:
-        """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
-
-        Args:
-            states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False
-                where none of the robot's own did; what stands in `actions` there does not matter.
-
-        Returns:
-            [state | action relative to it | known], normalised; actions are 0 where they are not known.
-
-        Raises:
-            UserError: there are no statistics.
-        """
-        stats = self.require_stats()
-        felt = torch.from_numpy(np.asarray(states, np.float32))
-        done = torch.from_numpy(np.asarray(actions, np.float32))
-        own = torch.from_numpy(np.asarray(known, np.float32))[:, None]
-        relative = self.embodiment.action.to_relative(done[:, None], felt)[:, 0]
-        return torch.cat([normalize(felt, stats.state), normalize(relative, stats.actions) * own, own], 1)
 
     # Batches
 
-    def item(self, sample: Sample) -> dict[str, Any]:
-        """One training step without a batch axis, for `collate`."""
-        raise NotImplementedError
-
-    def keyframe_item(self, sample: Any) -> dict[str, Any]:
-        """The same of a run of keyframes with depth (`mme_vla.data.keyframe_dataset`), where samples are such."""
+    def item(self, sample: Any) -> dict[str, Any]:
+        """One training sample without a batch axis, for `collate`: of a `Sample`, or of a run of keyframes."""
         raise NotImplementedError
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
@@ -236,18 +207,41 @@ class PolicyProcessor:
         """Read what `save` wrote; nothing outside of the folder is read on its word.
 
         Args:
-            folder: of a checkpoint, which may be a stranger's.
+            folder: of a checkpoint, which may be untrusted.
             tokenizer: in place of the one that `processor.json` names.
         """
         raise NotImplementedError
 
 
-def read_settings(folder: Path) -> dict[str, Any]:
-    """What `processor.json` of a checkpoint says.
+@runtime_checkable
+class HasMemoryImages(Protocol):
+    """A processor for networks whose memory stores vision tokens."""
 
-    Raises:
-        UserError: there is none, or it is damaged.
+    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
+        """Resize memory frames [n, H, W, 3] uint8 for the vision tower, on `device` if one is given."""
+        ...
+
+
+def motion_rows(processor: PolicyProcessor, states: np.ndarray, actions: np.ndarray, known: np.ndarray) -> Tensor:
+    """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
+
+    Args:
+        states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False where
+            no action of the robot led to the frame; the values in `actions` are ignored there.
+
+    Returns:
+        [state | action relative to it | known], normalised; actions are 0 where they are not known.
     """
+    stats = processor.require_stats()
+    proprio = torch.from_numpy(np.asarray(states, np.float32))
+    done = torch.from_numpy(np.asarray(actions, np.float32))
+    is_known = torch.from_numpy(np.asarray(known, np.float32))[:, None]
+    relative = processor.embodiment.action.to_relative(done[:, None], proprio)[:, 0]
+    return torch.cat([normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known], 1)
+
+
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Read `processor.json` of a checkpoint."""
     if not (folder / CONFIG_FILE).is_file():
         raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
     check_sums(folder, [CONFIG_FILE])
@@ -256,11 +250,33 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def load_processor(folder: Path | str, tokenizer: Path | str | None = None) -> PolicyProcessor:
-    """Read the processor of a checkpoint, of whatever kind.
-
-    Raises:
-        UserError: no processor there, a damaged one, one of an unknown kind, or one that names files elsewhere.
-    """
+    """Read the processor of a checkpoint, of whatever kind."""
     folder = Path(folder)
     kind: type[PolicyProcessor] = PROCESSORS[read_settings(folder).get("name", DEFAULT)]
     return kind.load(folder, tokenizer)
+
+
+def collate(items: Sequence[dict[str, Any]]) -> Batch:
+    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([item[name] for item in items])
+
+    images = stack("images")
+    batch = Batch(
+        images=images,
+        image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
+        prompt=stack("prompt"),
+        prompt_mask=stack("prompt_mask"),
+        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+        actions=stack("actions"),
+        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
+        state=stack("state"),
+        past=stack_past([item.get("past") for item in items]),
+    )
+    return batch.without_prompt_padding()
+
+
+def pad_width(x: Tensor, width: int) -> Tensor:
+    """Append zeros to the last dimension until it is `width` long."""
+    return functional.pad(x, (0, width - x.shape[-1]))

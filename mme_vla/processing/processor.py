@@ -1,7 +1,7 @@
 """`Processor`: what stands between raw data and a network that reads prompts, π0.5's above all."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -9,30 +9,110 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.shape import shape_of
+from mme_vla.backbone.config import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
-from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, PolicyProcessor, Sample
-from mme_vla.processing.collating import collate
-from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
-from mme_vla.processing.padding import pad_width
-from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
-from mme_vla.processing.processor_files import TOKENIZER_FILE, constructor_settings, own_settings
+from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.processing.base import (
+    CONFIG_FILE,
+    STATS_FILE,
+    PolicyProcessor,
+    PromptSpec,
+    Sample,
+    collate,
+    pad_width,
+    read_settings,
+)
+from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
+from mme_vla.processing.normalise import NormStats, normalize, unnormalize
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
-from mme_vla.processing.tokenizer import HUB, Tokenizer
+from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch
+from mme_vla.utils import check_sums, inside
+
+TOKENIZER_FILE = "tokenizer.model"
+OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]  # what processors named before robots could be chosen: front and wrist
+
+
+def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) -> dict[str, Any]:
+    """The arguments of a processor's constructor out of the words of `Processor.from_config`.
+
+    Args:
+        arguments: the constructor's, by name.
+    """
+    settings = dict(config)
+    known = {*arguments, "tokenizer_fingerprint", "views"}
+    for key in settings:
+        if key not in known:
+            raise UserError(f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}")
+    for key in ("image_size", "tokenizer"):
+        if key not in settings:
+            raise UserError(f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
+    PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
+    fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
+    if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
+        raise UserError(f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now.")
+    if (robot := settings.pop("embodiment", None)) is not None:
+        settings["embodiment"] = Embodiment.from_dict(robot)
+    tokenizer = Tokenizer.load(settings.pop("tokenizer"))
+    if fingerprint is not None and tokenizer.fingerprint != fingerprint:
+        raise UserError(
+            f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {brief(fingerprint)} "
+            "was used in training: its ids would mean other words. Give the file that was used."
+        )
+    stats = None if stats is None else NormStats.load(stats)
+    return {**settings, "tokenizer": tokenizer, "stats": stats}
+
+
+def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
+    """Read `processor.json` of a checkpoint; check that its files are in the folder, and their checksums.
+
+    Args:
+        tokenizer: in place of the one it names.
+    """
+    config = read_settings(folder)
+    named, stats = config.get("tokenizer", ""), config.get("stats")
+    if tokenizer is None:
+        tokenizer = saved_tokenizer(folder, named)
+    if stats is not None:
+        stats = saved_file(folder, stats, "statistics")
+    return {**config, "tokenizer": tokenizer, "stats": stats}
+
+
+def saved_file(folder: Path, name: Any, what: str) -> Path:
+    """The path of a file that a checkpoint names in itself, compared with its checksum where there is one."""
+    if not isinstance(name, str):
+        raise UserError(f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
+    path = inside(folder, name, what)
+    check_sums(folder, [name])
+    return path
+
+
+def saved_tokenizer(folder: Path, name: Any) -> str | Path:
+    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address."""
+    if name in (SAMPLE, PALIGEMMA):
+        return str(name)
+    if isinstance(name, str) and name.startswith(HUB):
+        if (folder / TOKENIZER_FILE).is_file():
+            return saved_file(folder, TOKENIZER_FILE, "tokenizer")
+        raise UserError(
+            f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not fetched on a "
+            f"checkpoint's word. If you trust it: from_pretrained(…, tokenizer={brief(name, 200)}), or download that "
+            f"file into the folder as {TOKENIZER_FILE}."
+        )
+    return saved_file(folder, name, "tokenizer")
+
 
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
 
 
 @PROCESSORS.register("pi05")
 class Processor(PolicyProcessor):
-    """Turns raw pictures, words, states and actions into what the network reads, and its answer back into actions.
+    """Converts raw images, text, states and actions into the network's inputs, and its chunks into actions.
 
     Args:
-        image_size: s; side of the square pictures the vision tower takes, in pixels.
+        image_size: s; side of the square images the vision tower takes, in pixels.
         tokenizer: turns prompts into ids.
         prompt: name of the prompt format (`PROMPTS`).
         prompt_length: longest prompt in tokens, without the options of a robot that chooses.
@@ -41,9 +121,6 @@ class Processor(PolicyProcessor):
         horizon: h; steps in a chunk; None for the embodiment's.
         embodiment: the robot: its cameras, in the order the network sees them, its state and its actions.
         stats: normalisation statistics; without them everything works but states and actions.
-
-    Raises:
-        UserError: an unknown prompt format, a size that is not positive, or actions wider than the network's.
     """
 
     def __init__(
@@ -78,55 +155,37 @@ class Processor(PolicyProcessor):
         self.subgoal_length = subgoal_length
         self.action_dim = action_dim
         self.embodiment = embodiment if horizon is None else embodiment.with_horizon(horizon)
-        self.embodiment.check_network(action_dim, self.horizon)
+        self.embodiment.check_network(action_dim, self.embodiment.action.horizon)
         self.stats = stats
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes.
-
-        Raises:
-            UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
-        """
         backbone = shape_of(sections["backbone"])
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
         processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
-        room = backbone.vocab_size
-        if room is not None and processor.tokenizer.vocab_size > room:
+        vocab_size = sections["backbone"].get("vocab_size")
+        if vocab_size is not None and processor.tokenizer.vocab_size > vocab_size:
             raise UserError(
                 f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-                f"backbone.vocab_size={room}: choose the processor that goes with the backbone."
+                f"backbone.vocab_size={vocab_size}: choose the processor that goes with the backbone."
             )
         return processor
 
     @property
-    def reads_subgoal(self) -> bool:
-        """Whether the prompt holds a subgoal."""
-        return self.prompt_format.reads_subgoal
-
-    @property
-    def past_actions(self) -> int:
-        """Executed actions in the prompt."""
-        return self.prompt_format.past_actions
+    def prompt_spec(self) -> PromptSpec:
+        kind, tokenizer = self.prompt_format, self.tokenizer
+        return PromptSpec(
+            tokenizer.spec, self.prompt_name, kind.reads_subgoal, kind.past_actions, tokenizer.fingerprint
+        )
 
     @property
     def longest_prompt(self) -> int:
         """Tokens of a prompt: `prompt_length`, and what the robot's options have."""
         return self.prompt_length + self.embodiment.action.options_length
 
-    @property
-    def words_from(self) -> str:
-        """The tokenizer."""
-        return self.tokenizer.spec
-
-    @property
-    def words_fingerprint(self) -> str | None:
-        """The tokenizer's."""
-        return self.tokenizer.fingerprint
-
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Resize the current pictures of all cameras with Pillow, as released.
+        """Resize the current images of all cameras with Pillow, as released.
 
         Args:
             views: one entry a camera in the order of the embodiment's: [H, W, 3], or [n, H, W, 3] for n observations;
@@ -134,16 +193,13 @@ class Processor(PolicyProcessor):
 
         Returns:
             [v, 3, s, s] uint8, or [n, v, 3, s, s].
-
-        Raises:
-            UserError: a camera too many or too few, or pictures of another form.
         """
         names = self.embodiment.camera_names
         if len(views) != len(names):
             raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
         if len({view.shape for view in resized}) > 1:
-            raise UserError(f"All views need as many pictures, got shapes {[list(view.shape) for view in resized]}.")
+            raise UserError(f"All views need as many images, got shapes {[list(view.shape) for view in resized]}.")
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3)))
 
     def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
@@ -170,24 +226,21 @@ class Processor(PolicyProcessor):
 
         Returns:
             ids [l] int64 and mask [l] bool.
-
-        Raises:
-            UserError: the format needs a state or actions that are not given, or statistics to normalise them.
         """
         normalised, past = None, None
         if state is not None and self.prompt_format.reads_state:
             normalised = normalize(_float(state), self.require_stats().state).numpy()
-        wanted = self.prompt_format.past_actions
-        if wanted and state is not None and past_actions is not None:
-            recent = self.embodiment.action.to_relative(_float(past_actions)[-wanted:], _float(state))
+        count = self.prompt_format.past_actions
+        if count and state is not None and past_actions is not None:
+            recent = self.embodiment.action.to_relative(_float(past_actions)[-count:], _float(state))
             past = normalize(recent, self.require_stats().actions).numpy()
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
-        given = PromptInput(goal, subgoal, normalised, past)
-        return encode_prompt(self.prompt_format, self.tokenizer, given, self.longest_prompt)
+        inputs = PromptInput(goal, subgoal, normalised, past)
+        return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        """Turn recorded actions into what the network should answer.
+        """Convert recorded actions into targets of the network.
 
         Args:
             chunk: [h, w] absolute actions.
@@ -195,22 +248,20 @@ class Processor(PolicyProcessor):
 
         Returns:
             [h, action_dim] float32: relative where the embodiment says so, quantile-normalised, padded with zeros.
-
-        Raises:
-            UserError: there are no statistics, or the shapes do not fit.
         """
         stats = self.require_stats()
         chunk, state = _float(chunk), _float(state)
-        if chunk.shape != (self.horizon, len(stats.actions)) or state.shape != (len(stats.state),):
+        horizon = self.embodiment.action.horizon
+        if chunk.shape != (horizon, len(stats.actions)) or state.shape != (len(stats.state),):
             raise UserError(
-                f"Expected actions [{self.horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
+                f"Expected actions [{horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
                 f"got {list(chunk.shape)} and {list(state.shape)}."
             )
         relative = self.embodiment.action.to_relative(chunk, state)
         return pad_width(normalize(relative, stats.actions), self.action_dim)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """Turn the network's answer into actions the robot takes: the inverse of `actions`.
+        """Convert a chunk of the network into actions of the robot: the inverse of `actions`.
 
         Args:
             chunk: [..., h, action_dim] normalised.
@@ -218,16 +269,13 @@ class Processor(PolicyProcessor):
 
         Returns:
             [..., h, w] float32 on the device of `chunk`.
-
-        Raises:
-            UserError: there are no statistics.
         """
         stats = self.require_stats()
         relative = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
         return self.embodiment.action.to_absolute(relative, state.to(relative))
 
     def item(self, sample: Sample) -> dict[str, Any]:
-        """Pictures [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
+        """Images [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
         state = sample.states[-1]
         prompt, prompt_mask = self.prompt(
             sample.goal, subgoal=sample.subgoal, state=state, past_actions=sample.past_actions
@@ -267,32 +315,26 @@ class Processor(PolicyProcessor):
             config: the constructor's arguments by name, some in words: `tokenizer` as `Tokenizer.load` takes it,
                 `stats` as the path of a `norm_stats.json` or None, `embodiment` as `Embodiment.to_dict` writes it (left
                 out: RoboMME's Panda, as before). `tokenizer_fingerprint`, if given, is checked.
-
-        Raises:
-            UserError: an unknown, missing or impossible entry.
         """
         return cls(**constructor_settings(config, inspect.signature(cls).parameters))
 
     def save(self, folder: Path | str) -> list[str]:
         """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the names of the files."""
-        written = super().save(folder)
+        saved = super().save(folder)
         if self.to_config()["tokenizer"] == TOKENIZER_FILE:
             self.tokenizer.save(Path(folder) / TOKENIZER_FILE)
-            written.append(TOKENIZER_FILE)
-        return written
+            saved.append(TOKENIZER_FILE)
+        return saved
 
     @classmethod
     def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
         """Read what `save` wrote. Nothing outside of the folder is read for it, and of the hub only π0.5's tokenizer.
 
         Args:
-            folder: of a checkpoint, which may be a stranger's.
+            folder: of a checkpoint, which may be untrusted.
             tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes it.
-
-        Raises:
-            UserError: `folder` holds no processor, a damaged one, or one that names files elsewhere.
         """
-        config = own_settings(Path(folder), tokenizer)
+        config = saved_settings(Path(folder), tokenizer)
         try:
             return cls.from_config(config)
         except UserError as error:

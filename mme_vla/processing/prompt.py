@@ -1,16 +1,20 @@
-"""What the policy is told in words. A format is one class here; everything else refers to it by name."""
+"""What the policy is reported. A format is one class here; everything else refers to it by name."""
 
+import re
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief
-from mme_vla.files import is_text
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import Registry
+from mme_vla.utils import is_text
 
 BINS = 256
 
@@ -38,14 +42,14 @@ class PromptInput:
 class PromptFormat:
     """The interface of a prompt format.
 
-    A subclass sets what it reads beside the goal (so that nobody computes the rest) and implements `pieces`.
+    A subclass sets what it reads beside the goal and implements `pieces`.
     """
 
     reads_subgoal: bool = False
     reads_state: bool = False
     past_actions: int = 0  # how many executed actions it reads
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return the texts in order; each is tokenised by itself."""
         raise NotImplementedError
 
@@ -54,12 +58,12 @@ PROMPTS: Registry[type[PromptFormat]] = Registry("prompt format")
 
 
 @PROMPTS.register("plain")
-class Plain(PromptFormat):
+class GoalPrompt(PromptFormat):
     """The goal and a newline: π0.5 without state in the prompt, and every policy with a neural memory."""
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return the goal, then the newline, which is tokenised apart."""
-        return [(_one_line(given.goal), True), ("\n", False)]
+        return [(_one_line(inputs.goal), True), ("\n", False)]
 
 
 @PROMPTS.register("state")
@@ -68,46 +72,41 @@ class State(PromptFormat):
 
     reads_state = True
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
-        """Return one text.
-
-        Raises:
-            UserError: there is no state.
-        """
-        if given.state is None:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
+        if inputs.state is None:
             raise UserError(
                 "The prompt format 'state' needs the robot's state; give one, or choose the format 'plain'."
             )
-        levels = " ".join(map(str, discretize(given.state)))
-        return [(f"Task: {_one_line(given.goal)}; State: {levels};\nAction: ", True)]
+        levels = " ".join(map(str, discretize(inputs.state)))
+        return [(f"Task: {_one_line(inputs.goal)}; State: {levels};\nAction: ", True)]
 
 
 @PROMPTS.register("subgoal")
 class Subgoal(PromptFormat):
     """The goal and the language subgoal: symbolic memory, as released.
 
-    Where a step has no subgoal the prompt is the plain one (as released), and a warning says so once.
+    Where a step has no subgoal the prompt is the plain one (as released), with one warning.
     """
 
     reads_subgoal = True
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
-        if given.subgoal is None:
+        if inputs.subgoal is None:
             _warn_once("The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as released.")
-            return Plain().pieces(given)
-        return [(f"Task: {_one_line(given.goal)};\nCurrent Subgoal: {_one_line(given.subgoal)};\nAction: ", True)]
+            return GoalPrompt().pieces(inputs)
+        return [(f"Task: {_one_line(inputs.goal)};\nCurrent Subgoal: {_one_line(inputs.subgoal)};\nAction: ", True)]
 
 
 @PROMPTS.register("subgoal_sentence")
 class SubgoalSentence(Subgoal):
     """The goal and the subgoal with the punctuation of the real-robot release, which has a state but leaves it out."""
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
-        if given.subgoal is None:
-            return super().pieces(given)
-        return [(f"Task: {_one_line(given.goal)}\nCurrent Subgoal: {_one_line(given.subgoal)}.\nAction: ", True)]
+        if inputs.subgoal is None:
+            return super().pieces(inputs)
+        return [(f"Task: {_one_line(inputs.goal)}\nCurrent Subgoal: {_one_line(inputs.subgoal)}.\nAction: ", True)]
 
 
 @PROMPTS.register("past_actions")
@@ -120,31 +119,25 @@ class PastActions(PromptFormat):
 
     past_actions = 16
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
-        """Return one text.
-
-        Raises:
-            UserError: it was not told which actions were executed.
-        """
-        if given.past_actions is None:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
+        if inputs.past_actions is None:
             raise UserError(
                 "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, w])."
             )
-        levels = " ".join(map(str, discretize(given.past_actions.reshape(-1))))
-        return [(f"Task: {_one_line(given.goal)}; Past actions: {levels};\nAction: ", True)]
+        levels = " ".join(map(str, discretize(inputs.past_actions.reshape(-1))))
+        return [(f"Task: {_one_line(inputs.goal)}; Past actions: {levels};\nAction: ", True)]
 
 
 @PROMPTS.register("openvla")
 class OpenVla(PromptFormat):
     """The question that OpenVLA was trained on, the goal in lower case."""
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
-        """Return one text."""
-        return [(f"In: What action should the robot take to {self.language(given)}?\nOut:", True)]
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
+        return [(f"In: What action should the robot take to {self.language(inputs)}?\nOut:", True)]
 
-    def language(self, given: PromptInput) -> str:
+    def language(self, inputs: PromptInput) -> str:
         """What the robot is asked to do."""
-        return given.goal.strip().lower()
+        return inputs.goal.strip().lower()
 
 
 @PROMPTS.register("openvla_subgoal")
@@ -153,13 +146,13 @@ class OpenVlaSubgoal(OpenVla):
 
     reads_subgoal = True
 
-    def language(self, given: PromptInput) -> str:
+    def language(self, inputs: PromptInput) -> str:
         """The goal without its full stop, and the subgoal."""
-        if given.subgoal is None:
+        if inputs.subgoal is None:
             _warn_once("The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain prompt.")
-            return super().language(given)
-        goal = given.goal.strip().removesuffix(".")
-        return f"{goal}; current subgoal: {given.subgoal.strip()}".lower()
+            return super().language(inputs)
+        goal = inputs.goal.strip().removesuffix(".")
+        return f"{goal}; current subgoal: {inputs.subgoal.strip()}".lower()
 
 
 def discretize(values: np.ndarray) -> list[int]:
@@ -169,11 +162,7 @@ def discretize(values: np.ndarray) -> list[int]:
 
 
 def checked_text(text: object, what: str) -> str:
-    """`text`, if a tokenizer can take it.
-
-    Raises:
-        UserError: it is no text, or holds half a character (a lone surrogate), which no UTF-8 has.
-    """
+    """`text`, if a tokenizer can take it."""
     if not isinstance(text, str):
         raise UserError(f"{what} must be a text, got {brief(text)}.")
     if not is_text(text):
@@ -182,25 +171,25 @@ def checked_text(text: object, what: str) -> str:
 
 
 def encode_prompt(
-    prompt_format: PromptFormat, tokenizer: Tokenizer, given: PromptInput, max_length: int
+    prompt_format: PromptFormat, tokenizer: Tokenizer, inputs: PromptInput, max_length: int
 ) -> tuple[Tensor, Tensor]:
     """Turn a prompt into token ids.
 
     Args:
         prompt_format: which texts to build (`PROMPTS[name]()`).
         tokenizer: its ids.
-        given: what the texts are made of.
-        max_length: l; a longer prompt loses its end, and a warning says so once.
+        inputs: what the texts are made of.
+        max_length: l; a longer prompt loses its end, with one warning.
 
     Returns:
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
-    checked_text(given.goal, "the goal")
-    tokens = [token for text, bos in prompt_format.pieces(given) for token in tokenizer.encode(text, bos=bos)]
+    checked_text(inputs.goal, "the goal")
+    tokens = [token for text, bos in prompt_format.pieces(inputs) for token in tokenizer.encode(text, bos=bos)]
     if len(tokens) > max_length:
         _warn_once(
             f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise prompt_length. "
-            f"The first one, {len(tokens)} tokens long: {brief(given.goal, 200)}.",
+            f"The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
             key=("truncated", max_length),
         )
         tokens = tokens[:max_length]
@@ -230,3 +219,73 @@ def _warn_once(message: str, key: object = None) -> None:
     if (key or message) not in _warned:
         _warned.add(key or message)
         warnings.warn(message, stacklevel=3)
+
+
+KINDS = ("simple_subgoal", "grounded_subgoal")
+POINT = re.compile(r"at <(-?\d+), (-?\d+)>")
+STD_PER_LIMIT = 1 / 2.5  # the noise's standard deviation, as a share of where it is cut off
+
+
+@dataclass(frozen=True)
+class SubgoalText:
+    """Chooses the text of one training step, as released.
+
+    kind: `simple_subgoal` or `grounded_subgoal`.
+    online_probability: how often the label is the one the simulator reports at test time, which switches a little
+        earlier than the planner's.
+    point_noise: pixels; a text with exactly one point `at <y, x>` gets Gaussian noise on both numbers, cut off here
+        and rounded. 0 adds none. The result may leave the image, as released.
+    """
+
+    kind: str
+    online_probability: float = 0.5
+    point_noise: int = 8
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UserError(f"subgoal_text.kind={self.kind!r}. {did_you_mean(str(self.kind), KINDS)}")
+        if not 0 <= self.online_probability <= 1:
+            raise UserError(f"subgoal_text.online_probability={self.online_probability} must lie between 0 and 1.")
+        if self.point_noise < 0:
+            raise UserError(f"subgoal_text.point_noise={self.point_noise} must be a number of pixels, 0 for none.")
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:
+        """Build from the section `subgoal_text`, or return None where there is none."""
+        return None if config is None else read_section(cls, config, "subgoal_text")
+
+    @property
+    def columns(self) -> tuple[str, str]:
+        """The dataset columns it reads."""
+        return self.kind, f"{self.kind}_online"
+
+    def __call__(self, texts: Mapping[str, str], rng: np.random.Generator) -> str:
+        """Choose among a step's `texts`, by column name, and perturb the point."""
+        planner, online = self.columns
+        text = texts[online if rng.random() < self.online_probability else planner]
+        return perturb_point(text, self.point_noise, rng) if self.point_noise else text
+
+
+def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
+    """Move the one point of a text by up to `limit` pixels; a text with no point or several stays as it is."""
+    if len(POINT.findall(text)) != 1:
+        return text
+    shift = np.clip(rng.normal(0, limit * STD_PER_LIMIT, 2), -limit, limit).round().astype(int)
+
+    def shifted(match: re.Match[str]) -> str:
+        y, x = (int(match[i + 1]) + int(shift[i]) for i in range(2))
+        return f"at <{y}, {x}>"
+
+    return POINT.sub(shifted, text)
+
+
+def subgoal_kind(policy: Any) -> str | None:
+    """`simple_subgoal` or `grounded_subgoal`, as the policy was trained; None where it reads none.
+
+    Args:
+        policy: anything with a policy's processor and configuration.
+    """
+    if not policy.require_processor().prompt_spec.reads_subgoal:
+        return None
+    kind = (policy.config.get("subgoal_text") or {}).get("kind")
+    return None if kind is None else str(kind)

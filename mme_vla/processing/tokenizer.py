@@ -41,9 +41,6 @@ class Tokenizer:
         Args:
             spec: "sample" for the small model shipped with the library, the path of a `.model` file, or
                 "hf://owner/repository/path/in/it.model" for a file on the Hugging Face hub.
-
-        Raises:
-            UserError: there is no such file, it is no SentencePiece model, or the hub cannot give it.
         """
         spec = str(spec)
         if spec == SAMPLE:
@@ -68,23 +65,15 @@ class Tokenizer:
         return self._processor.encode(text, add_bos=bos)
 
     def piece(self, text: str) -> int:
-        """The id of one piece, as the model spells it (`▁` stands for a space).
-
-        Raises:
-            UserError: the model has no such piece.
-        """
-        found = self._processor.piece_to_id(text)
-        if found == self._processor.unk_id():
+        """The id of one piece, as the model spells it (`▁` means a space)."""
+        index = self._processor.piece_to_id(text)
+        if index == self._processor.unk_id():
             raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
-        return found
+        return index
 
     @property
     def end(self) -> int:
-        """The id that ends a text.
-
-        Raises:
-            UserError: the model has none.
-        """
+        """The id that ends a text."""
         if self._processor.eos_id() < 0:
             raise UserError(f"Tokenizer {self.spec!r} has no end-of-sequence token, which this policy's prompts need.")
         return self._processor.eos_id()
@@ -102,8 +91,8 @@ def _download(spec: str) -> Path:
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
-    owner, _, rest = spec.removeprefix(HUB).partition("/")
-    name, _, filename = rest.partition("/")
+    owner, _, remaining = spec.removeprefix(HUB).partition("/")
+    name, _, filename = remaining.partition("/")
     if not (owner and name and filename):
         raise UserError(f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.")
     try:
@@ -112,5 +101,5 @@ def _download(spec: str) -> Path:
         raise UserError(
             f"The hub did not give the tokenizer {spec!r} ({type(error).__name__}: {str(error).splitlines()[0]}). "
             "Check the name, the network and `hf auth login` (PaliGemma's files ask you to accept a licence), "
-            "or download the file by hand and give its path."
+            "or download the file manually and give its path."
         ) from None

@@ -25,13 +25,13 @@ class Client:
 
     Args:
         url: `ws://host:port`.
-        api_key: what the server asks for, if it does.
+        api_key: of the server, if it has one.
         timeout: seconds to wait for an answer; a first request of 1,000 frames may take minutes on a CPU.
         open_timeout: seconds to wait for the connection and the server's metadata.
 
     Raises:
         UserError: not an address of a server, or the key is refused.
-        ConnectionError: nobody answers there.
+        ConnectionError: there is no server.
 
     >>> with Client("ws://127.0.0.1:8001") as client:  # doctest: +SKIP
     ...     client.reset()
@@ -51,7 +51,7 @@ class Client:
         self._socket: Any = None
         self._ends = ExitStack()
         self.metadata: dict[str, Any] = {}
-        """What the server said of itself when this client connected."""
+        """Description of the server, its first message."""
         self.reconnect()
 
     def reconnect(self) -> None:
@@ -72,8 +72,8 @@ class Client:
             raise UserError(f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
         except InvalidHandshake as error:
             reply = getattr(getattr(error, "response", None), "body", b"") or b""
-            said = bytes(reply).decode(errors="replace").strip()
-            raise UserError(f"The server at {self.url} refuses the connection: {said or error}") from None
+            message = bytes(reply).decode(errors="replace").strip()
+            raise UserError(f"The server at {self.url} refuses the connection: {message or error}") from None
         except (OSError, TimeoutError, EOFError) as error:
             raise ConnectionError(f"No policy server answers at {self.url}: {error}") from error
         self.metadata = self._receive(self.open_timeout)
@@ -96,7 +96,7 @@ class Client:
         return self.request({"add_buffer": True, "images": images, "state": states, "exec_start_idx": exec_start})
 
     def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Ask for the next chunk.
+        """Request the next chunk.
 
         Args:
             observation: of either schema: `observation/image`, `observation/wrist_image`, `observation/state` and
@@ -117,7 +117,7 @@ class Client:
         data = pack(message)
         if self._socket is None:
             raise ConnectionError("This client is closed: call reconnect().")
-        with suppress(ConnectionClosed):  # the server may have said why before it closed
+        with suppress(ConnectionClosed):  # the reason may have arrived before the close
             self._socket.send(data)
         return self._receive(self.timeout)
 
@@ -136,15 +136,15 @@ class Client:
 
     def _receive(self, timeout: float) -> dict[str, Any]:
         try:
-            answer = self._socket.recv(timeout)
+            response = self._socket.recv(timeout)
         except ConnectionClosed as error:
             self.close()
             raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from None
         except TimeoutError:
             self.close()  # an answer that came later would be taken for that of the next request
             raise TimeoutError(f"No answer from {self.url} within {timeout:g} s; call reconnect().") from None
-        if isinstance(answer, str):
+        if isinstance(response, str):
             self.close()
-            raise UserError(f"The server refuses this request: {answer}")
-        found: dict[str, Any] = unpack(answer)
-        return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in found.items()}
+            raise UserError(f"The server refuses this request: {response}")
+        fields: dict[str, Any] = unpack(response)
+        return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in fields.items()}

@@ -23,11 +23,7 @@ except ImportError as error:  # the extra is missing: say which
 
 
 def pack(message: Any) -> bytes:
-    """Encode a message.
-
-    Raises:
-        UserError: it holds something msgpack has no form for, such as an array of objects.
-    """
+    """Encode a message."""
     try:
         packed = msgpack.packb(message, default=_encode)
     except (TypeError, ValueError, OverflowError) as error:
@@ -37,12 +33,7 @@ def pack(message: Any) -> bytes:
 
 
 def unpack(data: bytes | bytearray | memoryview) -> Any:
-    """Decode a message. Arrays are read-only views on `data`: copy what is written to.
-
-    Raises:
-        UserError: it is no msgpack, it is cut short, it holds more than `MOST_OBJECTS` values, or an array in it is not
-            what it says.
-    """
+    """Decode a message. Arrays are read-only views on `data`: copy what is written to."""
     check_size(data)
     try:
         return msgpack.unpackb(
@@ -53,7 +44,7 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
         )
     except UserError:
         raise
-    except Exception as error:  # msgpack answers damage with many kinds of exception
+    except Exception as error:  # msgpack raises many kinds of exception
         raise UserError(f"This is not a msgpack message ({type(error).__name__}: {error}).") from error
 
 
@@ -87,9 +78,6 @@ def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -
     """Count the values of a message without making any: an empty map takes one byte here and 64 in memory.
 
     A message that is cut short or malformed passes; `unpack` says what is wrong with it.
-
-    Raises:
-        UserError: there are more than `most`.
     """
     at, end, waiting, announced = 0, len(data), 1, 1
     while waiting and at < end:
@@ -121,28 +109,28 @@ def _encode(value: Any) -> dict[bytes, Any]:
             b"dtype": value.dtype.str,
             b"shape": list(value.shape),
         }
-    plain = value.item()
-    if not isinstance(plain, bool | int | float | str | bytes):
+    scalar = value.item()
+    if not isinstance(scalar, bool | int | float | str | bytes):
         raise ValueError(f"a scalar of dtype {value.dtype} is not sent; make it a plain number")
-    return {b"__npgeneric__": True, b"data": plain, b"dtype": value.dtype.str}
+    return {b"__npgeneric__": True, b"data": scalar, b"dtype": value.dtype.str}
 
 
-def _decode(found: dict[Any, Any]) -> Any:
-    if b"__ndarray__" in found:
-        return _array(found)
-    if b"__npgeneric__" in found:
-        dtype, value = _dtype(found), found.get(b"data")
+def _decode(fields: dict[Any, Any]) -> Any:
+    if b"__ndarray__" in fields:
+        return _array(fields)
+    if b"__npgeneric__" in fields:
+        dtype, value = _dtype(fields), fields.get(b"data")
         if not isinstance(value, bool | int | float | str | bytes):
             raise UserError(f"A NumPy scalar of dtype {dtype} holds a {type(value).__name__}.")
         try:
             return dtype.type(value)
         except (ValueError, TypeError, OverflowError) as error:
             raise UserError(f"A NumPy scalar of dtype {dtype} holds {str(value)[:40]!r}: {error}") from None
-    return found
+    return fields
 
 
-def _array(found: dict[Any, Any]) -> np.ndarray:
-    dtype, shape, data = _dtype(found), found.get(b"shape"), found.get(b"data")
+def _array(fields: dict[Any, Any]) -> np.ndarray:
+    dtype, shape, data = _dtype(fields), fields.get(b"shape"), fields.get(b"data")
     if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
         raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
     if not isinstance(data, bytes):
@@ -156,8 +144,8 @@ def _array(found: dict[Any, Any]) -> np.ndarray:
         raise UserError(f"An array cannot have the shape {shape}: {error}") from None
 
 
-def _dtype(found: dict[Any, Any]) -> np.dtype:
-    name = found.get(b"dtype")
+def _dtype(fields: dict[Any, Any]) -> np.dtype:
+    name = fields.get(b"dtype")
     if not isinstance(name, str) or len(name) > 16:
         raise UserError(f"An array's dtype must be a short text such as '<f4', got {str(name)[:40]!r}.")
     try:

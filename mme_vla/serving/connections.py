@@ -1,135 +1,156 @@
-"""Who is connected: how long each connection may stay silent, and which one goes where there are too many.
+"""Places on the server: time limits of connections, and which one is closed when the server is full.
 
-The two classes at the end are uvicorn's protocols. They add what uvicorn leaves open: a time limit for headers and for
-messages that stall, and a connection's own record, which the application finds in its scope.
+uvicorn parses HTTP and websockets, limits message sizes and pings. It has no time limit for headers, which an ASGI
+application never sees: `timed_protocol` notes when bytes arrive, by methods of `asyncio.Protocol` alone.
 """
 
 import asyncio
 import time
+from dataclasses import dataclass, field
 from typing import Any
 
-import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
-from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from mme_vla.serving.counters import ServerStats
+from mme_vla.serving.engine import ServerStats
 from mme_vla.serving.settings import Limits
 
 HEAD_S = 10  # seconds from a request's first byte (or the connection) to the end of its headers
-GOODBYE_S = 10  # seconds a client gets to answer a goodbye
-STRANGERS = 64  # most connections that have not yet made a request the key allows
-MOST_PIECES = 2**16  # most frames one websocket message may be cut into
+CLOSE_S = 10  # seconds for a client to complete the closing handshake
+MAX_UNAUTHENTICATED = 64  # connections without a request that the key allows
 FULL = "The server is full and this connection was silent longest; connect and begin the episode again."
 IDLE = "This connection was silent for limits.idle_s; connect and begin the episode again."
 
 
+@dataclass(eq=False)
 class Connection:
-    """One connection, whatever is spoken on it.
+    """One TCP connection.
 
     Attributes:
-        guest: it made a request that the key allows, and so holds one of `limits.connections` places.
+        admitted: it made a request that the key allows, and holds one of `limits.connections` places.
         websocket: it holds an episode of its own.
-        busy: it waits for an answer.
-        silent_since: when its last request was answered, or when it came.
-        dismissed: done once the connection is to end, with the code and the reason to tell a websocket client.
+        busy: a complete request waits for its response. A connection whose body still arrives is not busy.
+        in_head, in_request: headers arrive; they are complete, and the response is not.
+        silent_since, deadline: seconds of `time.monotonic`; the connection is closed at its deadline unless busy.
+        dismissed: code and reason with which a websocket is to be closed.
     """
 
-    def __init__(self, transport: asyncio.Transport) -> None:
-        self.transport = transport
-        self.guest = self.websocket = self.busy = False
-        self.silent_since = time.monotonic()
-        self.dismissed: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
-        self.until: float | None = None
-        self.unsent_since: float | None = None
+    transport: asyncio.Transport
+    address: Any
+    admitted: bool = False
+    websocket: bool = False
+    busy: bool = False
+    in_head: bool = True
+    in_request: bool = False
+    silent_since: float = field(default_factory=time.monotonic)
+    deadline: float | None = None
+    unsent_since: float | None = None
+    dismissed: asyncio.Future[tuple[int, str]] = field(default_factory=asyncio.Future)
 
-    def wait(self, seconds: float | None) -> None:
-        """Give it so many seconds from now on; None: as long as it takes."""
-        self.until = None if seconds is None else time.monotonic() + seconds
+    @property
+    def is_open(self) -> bool:
+        """Whether a request, or the closing handshake of a websocket, is not complete."""
+        return self.in_request or (self.websocket and not self.transport.is_closing())
 
-    def work(self, busy: bool) -> None:
-        """Note that a request begins, or that it is answered."""
+    def expire_in(self, seconds: float | None) -> None:
+        """Set the deadline; None for no deadline."""
+        self.deadline = None if seconds is None else time.monotonic() + seconds
+
+    def set_busy(self, busy: bool) -> None:
+        """Note that a request is complete, or that its response is."""
         self.busy, self.silent_since = busy, time.monotonic()
 
-    def let_go(self, code: int, reason: str) -> None:
-        """End it as soon as nothing is being answered: a websocket with a goodbye, HTTP at once."""
+    def close(self, code: int, reason: str) -> None:
+        """Close a websocket with code and reason once its response is sent, and HTTP at once."""
         if not self.websocket:
             self.transport.close()
         elif not self.dismissed.done():
             self.dismissed.set_result((code, reason))
-        self.wait(GOODBYE_S)
+        self.expire_in(CLOSE_S)
 
 
 class Connections:
     """All open connections of a server.
 
-    Connections of strangers never take a place from those who have shown the key: they have `STRANGERS` places of their
-    own, and the longest silent one goes first. Among the guests, the longest silent connection that waits for no answer
-    makes room for a new one; one that holds no episode goes before one that does.
+    Clients that have not shown the key hold no place: at most `MAX_UNAUTHENTICATED` of them are open, and the longest
+    silent one is closed first. When all places are taken, the longest silent connection that is not busy is closed
+    for a new client; HTTP, which holds no episode here, before websockets.
     """
 
     def __init__(self, limits: Limits, stats: ServerStats) -> None:
         self.limits, self._stats = limits, stats
-        self.open: set[Connection] = set()
+        self.open: dict[Any, Connection] = {}  # by the client's address and port, as in an ASGI scope
         self.stopping = False
 
     def arrive(self, transport: asyncio.Transport) -> Connection:
-        """Note a new connection."""
-        strangers = [known for known in self.open if not (known.guest or known.busy)]
-        if len(strangers) >= STRANGERS:
-            self._forget(min(strangers, key=_silence)).transport.abort()
-        connection = Connection(transport)
-        connection.wait(HEAD_S)
-        self.open.add(connection)
+        """Add a new connection."""
+        unauthenticated = [known for known in self.open.values() if not (known.admitted or known.busy)]
+        if len(unauthenticated) >= MAX_UNAUTHENTICATED:
+            oldest = min(unauthenticated, key=_silence)
+            oldest.transport.abort()
+            self.forget(oldest)
+        address = tuple((transport.get_extra_info("peername") or (id(transport), 0))[:2])
+        connection = self.open[address] = Connection(transport, address)
+        connection.expire_in(HEAD_S)
         return connection
 
+    def begin(self, connection: Connection, websocket: bool) -> None:
+        """Note that the headers of a request are complete."""
+        connection.websocket, connection.in_head, connection.in_request = websocket, False, True
+        connection.expire_in(None)
+
+    def end(self, connection: Connection) -> None:
+        """Note that a response is complete; the place of a websocket is free then."""
+        connection.in_request = False
+        connection.set_busy(False)
+        connection.expire_in(CLOSE_S if connection.websocket else self.limits.idle_s)
+        if connection.websocket:
+            connection.admitted = False
+            self._count()
+
     def admit(self, connection: Connection) -> bool:
-        """Give a connection a place, if there is one or can be made one."""
+        """Give a connection a place, if there is one or one can be freed."""
         if self.stopping:
             return False
-        guests = [known for known in self.open if known.guest and known is not connection]
-        if len(guests) >= self.limits.connections:
-            silent = [guest for guest in guests if not guest.busy]
+        admitted = [known for known in self.open.values() if known.admitted and known is not connection]
+        if len(admitted) >= self.limits.connections:
+            silent = [known for known in admitted if not known.busy]
             if not silent:
                 return False
-            first = min(silent, key=lambda guest: (guest.websocket, _silence(guest)))
-            first.guest = False
-            first.let_go(1001, FULL)
+            oldest = min(silent, key=lambda known: (known.websocket, _silence(known)))
+            oldest.admitted = False
+            oldest.close(1001, FULL)
             self._stats.count("let_go")
-        connection.guest = True
+        connection.admitted = True
         self._count()
         return True
 
-    def leave(self, connection: Connection) -> None:
-        """Free the place of a connection, gone or about to go."""
-        connection.guest = False
+    def forget(self, connection: Connection) -> None:
+        """Remove a connection that is closed."""
+        if self.open.get(connection.address) is connection:
+            del self.open[connection.address]
         self._count()
 
-    def gone(self, connection: Connection) -> None:
-        """Forget a connection that is closed."""
-        self._forget(connection)
-
-    def let_idle_go(self, code: int, reason: str) -> None:
-        """End all that wait for no answer; the others end after theirs."""
-        for connection in list(self.open):
+    def close_idle(self, code: int, reason: str) -> None:
+        """Close all connections that wait for no response; the others are closed after theirs."""
+        for connection in list(self.open.values()):
             if connection.websocket or not connection.busy:
-                connection.let_go(code, reason)
+                connection.close(code, reason)
 
     def abort(self) -> None:
-        """Cut what is left."""
-        for connection in list(self.open):
+        """Cut off what is left."""
+        for connection in list(self.open.values()):
             connection.transport.abort()
 
     async def watch(self) -> None:
-        """End connections that are silent, stalled, or take no answers, for as long as the server runs."""
+        """Close connections that are silent, stalled, or do not read their responses, while the server runs."""
         limits = self.limits
-        every = min(1.0, limits.idle_s / 4, limits.send_s / 4, limits.receive_s / 4)
         while True:
-            await asyncio.sleep(every)
+            await asyncio.sleep(min(1.0, limits.idle_s / 4, limits.send_s / 4))
             now = time.monotonic()
-            for connection in list(self.open):
-                self._look_after(connection, now)
+            for connection in list(self.open.values()):
+                self._check(connection, now)
 
-    def _look_after(self, connection: Connection, now: float) -> None:
+    def _check(self, connection: Connection, now: float) -> None:
         if connection.transport.get_write_buffer_size() == 0:
             connection.unsent_since = None
         elif connection.unsent_since is None:
@@ -137,129 +158,39 @@ class Connections:
         elif now - connection.unsent_since > self.limits.send_s:
             self._stats.count("too_slow")
             connection.transport.abort()
-        if connection.until is None or connection.busy or now < connection.until:
+        if connection.deadline is None or connection.busy or now < connection.deadline:
             return
-        silent = connection.websocket and now - connection.silent_since >= self.limits.idle_s
-        if silent and not connection.dismissed.done():
-            connection.let_go(1001, IDLE)
+        if connection.websocket and connection.in_request and not connection.dismissed.done():
+            connection.close(1001, IDLE)
         else:
             connection.transport.abort()
-
-    def _forget(self, connection: Connection) -> Connection:
-        self.open.discard(connection)
-        self.leave(connection)
-        return connection
+            self.forget(connection)
 
     def _count(self) -> None:
-        self._stats.connections = sum(connection.guest for connection in self.open)
+        self._stats.connections = sum(known.admitted for known in self.open.values())
 
 
 def _silence(connection: Connection) -> float:
     return connection.silent_since
 
 
-class HttpProtocol(H11Protocol):
-    """HTTP/1.1 until a request asks for a websocket."""
+def timed_protocol(connections: Connections) -> type[H11Protocol]:
+    """HTTP protocol of uvicorn that adds each connection to `connections` and starts the time limit of headers."""
 
-    def __init__(self, config: Any, server_state: Any, app_state: dict[str, Any], _loop: Any = None) -> None:
-        super().__init__(config, server_state, app_state, _loop)
-        self._connections: Connections = app_state["connections"]
-        self._in_head = True
+    class TimedProtocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            self._connection = connections.arrive(transport)
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Note who came; the record travels in `scope["state"]`."""
-        super().connection_made(transport)
-        self._connection = self._connections.arrive(transport)
-        self.app_state = {**self.app_state, "connection": self._connection}
+        def data_received(self, data: bytes) -> None:
+            connection = self._connection
+            if not (connection.in_request or connection.in_head):
+                connection.in_head = True
+                connection.expire_in(HEAD_S)
+            super().data_received(data)
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget it."""
-        super().connection_lost(exc)
-        self._connections.gone(self._connection)
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            connections.forget(self._connection)
 
-    def data_received(self, data: bytes) -> None:
-        """Take what came; what cannot become a request is refused without waiting for the end of its line."""
-        if self.cycle is None and not self.conn.trailing_data[0] and not data[:3].isalpha():
-            return self.send_400_response("This is neither HTTP nor a websocket.")
-        super().data_received(data)
-        return self._settle()
-
-    def eof_received(self) -> None:
-        """Say what is wrong with a request that was cut short."""
-        if self.conn.their_state is h11.SEND_BODY or self.conn.trailing_data[0]:
-            super().data_received(b"")
-
-    def on_response_complete(self) -> None:
-        """Wait for the next request, but not for ever."""
-        super().on_response_complete()
-        self._settle()
-
-    def send_400_response(self, msg: str) -> None:
-        """Refuse what is no HTTP; where an answer has begun already, all there is left is to hang up."""
-        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-            super().send_400_response(msg + "\n")
-        else:
-            self.transport.close()
-
-    def _settle(self) -> None:
-        connection = self._connection
-        if connection.websocket or self.transport.is_closing():
-            return
-        busy = self.cycle is not None and not self.cycle.response_complete
-        if busy != connection.busy:
-            connection.work(busy)
-        in_head = not busy and bool(self.conn.trailing_data[0])
-        if busy:
-            connection.wait(None)
-        elif in_head and not self._in_head:
-            connection.wait(HEAD_S)
-        elif not in_head and self.cycle is not None:
-            connection.wait(self._connections.limits.idle_s)
-        self._in_head = in_head or self.cycle is None
-
-
-class WebSocketProtocol(WebSocketsSansIOProtocol):
-    """A websocket, from its handshake on."""
-
-    def __init__(self, config: Any, server_state: Any, app_state: dict[str, Any], _loop: Any = None) -> None:
-        super().__init__(config, server_state, app_state, _loop)
-        self._connections: Connections = app_state["connections"]
-        self._connection: Connection = app_state["connection"]
-        self._connection.websocket = True
-        self._pieces = 0
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget it."""
-        super().connection_lost(exc)
-        self._connections.gone(self._connection)
-
-    def data_received(self, data: bytes) -> None:
-        """Take what came, and expect more of a message that has begun."""
-        super().data_received(data)
-        limits = self._connections.limits
-        within = self.frames or self.conn.reader.buffer
-        connection = self._connection
-        if connection.dismissed.done():
-            return
-        if within and not self.read_paused:
-            connection.wait(limits.receive_s)
-        else:  # an answer to a ping is no sign that the episode goes on
-            connection.until = connection.silent_since + limits.idle_s
-
-    def handle_text(self, event: Any) -> None:
-        """Begin a message of text."""
-        self._pieces = 0
-        super().handle_text(event)
-
-    def handle_bytes(self, event: Any) -> None:
-        """Begin a message."""
-        self._pieces = 0
-        super().handle_bytes(event)
-
-    def handle_cont(self, event: Any) -> None:
-        """Add to a message; its size is bounded already, this bounds what its pieces cost, empty ones included."""
-        self._pieces += 1
-        if self._pieces > MOST_PIECES:
-            self.conn.fail(1009, "a message in too many pieces")
-            return self.handle_parser_exception()
-        return super().handle_cont(event)
+    return TimedProtocol

@@ -3,27 +3,80 @@
 import asyncio
 import logging
 import time
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mme_vla.policy.base import Policy
-from mme_vla.policy.batching import Act, Read, Turns
+from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.episode import Episode
-from mme_vla.serving.counters import ServerStats
+from mme_vla.policy.scheduler import Act, Read, Scheduler
+
+WINDOW = 2048  # latest durations kept of each kind
+
+
+class ServerStats:
+    """Counts since the start, and percentiles over the latest `WINDOW` durations of each kind."""
+
+    def __init__(self) -> None:
+        self._begun = time.monotonic()
+        self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=WINDOW))
+        self.counts: Counter[str] = Counter()
+        self.connections = 0
+
+    def took(self, kind: str, seconds: float) -> None:
+        """Note one finished piece of work."""
+        self.counts[kind] += 1
+        self._seconds[kind].append(seconds)
+
+    def count(self, kind: str, by: int = 1) -> None:
+        """Count something that has no duration."""
+        self.counts[kind] += by
+
+    def percentiles(self, kind: str) -> dict[str, float] | None:
+        """p50, p95 and the longest in milliseconds, or None before the first."""
+        seconds = self._seconds.get(kind)
+        if not seconds:
+            return None
+        p50, p95 = np.percentile(np.fromiter(seconds, float), [50, 95])
+        return {"p50": round(p50 * 1e3, 2), "p95": round(p95 * 1e3, 2), "max": round(max(seconds) * 1e3, 2)}
+
+    def snapshot(self) -> dict[str, Any]:
+        """Everything as plain numbers and texts."""
+        batches = self.counts["batch"]
+        return {
+            "uptime_s": round(time.monotonic() - self._begun, 1),
+            "connections": self.connections,
+            "counts": dict(sorted(self.counts.items())),
+            "mean_batch": round(self.counts["batched"] / batches, 2) if batches else None,
+            "latency_ms": {kind: self.percentiles(kind) for kind in sorted(self._seconds)},
+        }
+
+    def line(self) -> str:
+        """One line for a log."""
+        infer = self.percentiles("infer")
+        times = f"p50 {infer['p50']:.0f} ms, p95 {infer['p95']:.0f} ms" if infer else "none yet"
+        mean = self.snapshot()["mean_batch"]
+        batch = f", {mean} to a batch" if mean else ""
+        return (
+            f"{self.connections} clients · {self.counts['infer']} inferences ({times}{batch}) · "
+            f"{self.counts['refused']} requests refused, {self.counts['failed']} failed"
+        )
+
 
 logger = logging.getLogger("mme_vla.serving")
 
 
 @dataclass(eq=False)
 class _Waiting[T]:
-    """A piece of work and who waits for it; a future that is done already belongs to a client that has gone.
+    """A piece of work and its future, which is done already if the client has left.
 
-    pieces: those still to be run; 0 once it is done or nobody waits.
+    pieces: those still to be run; 0 once it is done or its client has left.
     """
 
     work: T
@@ -34,7 +87,7 @@ class _Waiting[T]:
 class Engine:
     """Runs the policy for all clients.
 
-    The event loop never computes. All computing happens in one thread, in the order of `mme_vla.policy.batching`.
+    The event loop never computes. All computing happens in one thread, in the order of `mme_vla.policy.scheduler`.
 
     Args:
         policy: with statistics, on its device.
@@ -48,7 +101,7 @@ class Engine:
         self.policy = policy
         self.flow_steps = flow_steps
         self.stats = stats or ServerStats()
-        self.turns: Turns[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Turns(max_batch)
+        self.scheduler: Scheduler[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Scheduler(max_batch)
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
         self._readers = ThreadPoolExecutor(2, "decode")
@@ -64,19 +117,19 @@ class Engine:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        for future in [*(w.future for w in self.turns.acting), *(w.future for w in self.turns.reading)]:
+        for future in [*(w.future for w in self.scheduler.acting), *(w.future for w in self.scheduler.reading)]:
             future.cancel()
         self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
-        """The next chunk [h, w] of an episode, chosen in one batch with whoever waits at the same time."""
-        chunk: np.ndarray = await self._join(self.turns.acting, episode)
+        """The next chunk [h, w] of an episode, in one batch with all episodes that wait at the same time."""
+        chunk: np.ndarray = await self._join(self.scheduler.acting, episode)
         return chunk
 
     async def run(self, steps: Iterator[None], pieces: int = 1) -> None:
         """Run an iterator that pauses between its `pieces` in the policy's thread, with others' work in the pauses."""
-        await self._join(self.turns.reading, steps, pieces)
+        await self._join(self.scheduler.reading, steps, pieces)
 
     async def call[T](self, function: Callable[[], T]) -> T:
         """Run something short in the policy's thread, at once."""
@@ -96,14 +149,14 @@ class Engine:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            while self.turns:
-                await self._turn()
+            while self.scheduler:
+                await self._run_scheduler()
 
-    async def _turn(self) -> None:
-        for step in self.turns.turn():
+    async def _run_scheduler(self) -> None:
+        for step in self.scheduler.next_steps():
             if isinstance(step, Read):
                 await self._piece(step.work)
-                await asyncio.sleep(0)  # those whose frames are in now ask for actions
+                await asyncio.sleep(0)  # clients whose frames are in request actions now
             elif isinstance(step, Act):
                 await self._batch([waiting for waiting in step.batch if not waiting.future.done()])
             else:
@@ -113,25 +166,27 @@ class Engine:
         if not batch:
             return
         begun = time.perf_counter()
-        chosen = await self.call(lambda: self._act([waiting.work for waiting in batch]))
+        chunks = await self.call(lambda: self._act([waiting.work for waiting in batch]))
         self.stats.took("batch", time.perf_counter() - begun)
         self.stats.count("batched", len(batch))
-        for waiting, chunk in zip(batch, chosen, strict=True):
+        for waiting, chunk in zip(batch, chunks, strict=True):
             if isinstance(chunk, Exception):
                 _fail(waiting.future, chunk)
             elif not waiting.future.done():
                 waiting.future.set_result(chunk)
-                self.turns.later[waiting.work] = None
+                self.scheduler.later[waiting.work] = None
 
     async def _prepare(self, episode: Episode) -> None:
         """A piece of what a client's next request will need, while its robot moves."""
+        if not isinstance(policy := self.policy, PreparesChunks):
+            return
         try:
-            left = await self.call(lambda: self.policy.prepare(episode))
+            left = await self.call(lambda: policy.prepare(episode))
         except Exception:
-            logger.exception("preparing an episode's next chunk failed; it will be computed when it is asked for")
+            logger.exception("preparing an episode's next chunk failed; it will be computed on request")
             return
         if left:
-            self.turns.later[episode] = None
+            self.scheduler.later[episode] = None
 
     def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
         """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that none fails another."""

@@ -16,9 +16,8 @@ from mme_vla.embodiment.robomme import CAMERAS, check_benchmark
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
-from mme_vla.processing.subgoal_text import subgoal_kind
-from mme_vla.serving.listen import is_local
-from mme_vla.serving.settings import ServeSettings
+from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.serving.settings import ServeSettings, is_local
 
 try:
     from jsonargparse import ActionConfigFile, ArgumentParser
@@ -38,10 +37,10 @@ SPACES = ("joint_angle", "ee_pose")
 
 @dataclass
 class Running:
-    """One session's episode, and the observations since its last chunk: pictures by camera, and states."""
+    """One session's episode, and the observations since its last chunk: images by camera, and states."""
 
     episode: Episode
-    pictures: list[dict[str, np.ndarray]] = field(default_factory=list)
+    images: list[dict[str, np.ndarray]] = field(default_factory=list)
     states: list[np.ndarray] = field(default_factory=list)
 
 
@@ -54,11 +53,8 @@ class MMEVLAModelServer(PredictModelServer):
         execute: actions of a chunk that are executed; by default the embodiment's.
         flow_steps: of an iterative head; by default its own.
         seed: of every episode's noise.
-        trust_plugins: import the modules that the checkpoint names: code of whoever wrote it.
+        trust_plugins: import the modules that the checkpoint names: their authors' code.
         max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of them.
-
-    Raises:
-        UserError: no such checkpoint, or a policy that cannot act from what the harness sends.
     """
 
     def __init__(
@@ -87,11 +83,11 @@ class MMEVLAModelServer(PredictModelServer):
             )
         if robot.action.of_pose:
             raise UserError(
-                f"This policy answers with differences to poses ({robot.action.answers}), which the harness does not "
+                f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
                 "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
             )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
-        settings.check_robot(robot, self.policy.require_processor().past_actions)
+        settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
         self.sessions: dict[str, Running] = {}
         super().__init__(
@@ -101,21 +97,21 @@ class MMEVLAModelServer(PredictModelServer):
     def get_observation_params(self) -> dict[str, Any]:
         """What the benchmark is to send."""
         robot = self.policy.embodiment
-        wanted: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
-        wanted["send_wrist_image"] = CAMERAS[1] in robot.camera_names
+        params: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
+        params["send_wrist_image"] = CAMERAS[1] in robot.camera_names
         if self.subgoal is not None:
-            wanted |= {"send_subgoal": True, "subgoal_mode": self.subgoal.removesuffix("_subgoal")}
-        return wanted
+            params |= {"send_subgoal": True, "subgoal_mode": self.subgoal.removesuffix("_subgoal")}
+        return params
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """One action, as the benchmark's action space has it."""
         return {"action": RAW}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        """The pictures, the state and the words that are read."""
-        pictures = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
+        """The images, the state and the words that are read."""
+        images = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
         words = {"language": LANGUAGE} | ({} if self.subgoal is None else {"subgoal": LANGUAGE})
-        return {**pictures, "state": RAW, **words}
+        return {**images, "state": RAW, **words}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         """Begin a session's episode; its goal comes with the first observation."""
@@ -128,23 +124,19 @@ class MMEVLAModelServer(PredictModelServer):
         self.sessions.pop(ctx.session_id, None)
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
-        """Take a frame, and answer with the next action.
-
-        Raises:
-            UserError: it lacks a picture or the state; the harness ends such an episode as an error.
-        """
+        """Take a frame, and answer with the next action."""
         running = self.sessions.get(ctx.session_id)
         if running is None:
             raise UserError("an observation came before the start of an episode.")
-        pictures, state = obs.get("images") or {}, obs.get("states", obs.get("state"))
+        images, state = obs.get("images") or {}, obs.get("states", obs.get("state"))
         names = self.policy.embodiment.camera_names
-        lacking = [VIEWS[name] for name in names if pictures.get(VIEWS[name]) is None]
+        lacking = [VIEWS[name] for name in names if images.get(VIEWS[name]) is None]
         if lacking or state is None:
             raise UserError(
                 f"the observation lacks {', '.join([*lacking, *(['states'] if state is None else [])])}: the "
-                "environment failed, or the benchmark does not send what get_observation_params() asks for."
+                "environment failed, or the benchmark does not send what get_observation_params() lists."
             )
-        running.pictures.append({name: np.asarray(pictures[VIEWS[name]]) for name in names})
+        running.images.append({name: np.asarray(images[VIEWS[name]]) for name in names})
         running.states.append(np.asarray(state, np.float32))
         await super().on_observation(obs, ctx)
 
@@ -158,22 +150,18 @@ class MMEVLAModelServer(PredictModelServer):
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
         """A session's episode, after it has taken the frames since its last chunk."""
         running = self.sessions[ctx.session_id]
-        episode, pictures, states = running.episode, running.pictures, running.states
-        running.pictures, running.states = [], []
+        episode, images, states = running.episode, running.images, running.states
+        running.images, running.states = [], []
         episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
-            episode.remember(np.stack(video), is_demo=True)
-        episode.observe({name: np.stack([p[name] for p in pictures]) for name in pictures[0]}, np.stack(states))
+            episode.add_frames(np.stack(video), is_demo=True)
+        episode.observe({name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states))
         return episode
 
 
 def run_server(arguments: Sequence[str] | None = None) -> None:
-    """Serve with the command-line options of the harness's model servers, but on this machine alone by default.
-
-    Raises:
-        UserError: a checkpoint that cannot be served.
-    """
+    """Serve with the command-line options of the harness's model servers, but on this machine alone by default."""
     parser = ArgumentParser(description="A policy behind vla-evaluation-harness.")
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with these options")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on; clients send no key")
@@ -193,5 +181,5 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
         host, port = name or host, int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):
-        logger.warning("host=%s: whoever reaches this port can use it, the harness has no key", host)
+        logger.warning("host=%s: every client that reaches this port can use it, the harness has no key", host)
     serve(server, host=host, port=port)

@@ -11,16 +11,70 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
-from mme_vla.embodiment.options import read_options
+from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.serving.readings import read_beside
+
+POSE = (3, 4)
+DEEPEST = 32_767  # millimetres: the benchmark's depth is int16
+
+
+def read_beside(
+    robot: Embodiment, images: Mapping[str, np.ndarray], message: Mapping[str, Any], key: str
+) -> dict[str, np.ndarray]:
+    """Depth and poses of every camera that has them, one for each of its images.
+
+    Args:
+        images: [t, H, W, 3] by camera. message: lists (or arrays) of t readings. key: how it spells their names.
+
+    Returns:
+        By the robot's names: depth float32 [t, H, W, 1] in millimetres, poses float32 [t, 3, 4] from the world to the
+        camera.
+    """
+    readings = {}
+    for camera in robot.cameras:
+        for name, shape in zip(camera.readings, (images[camera.name].shape[1:3], POSE), strict=False):
+            readings[name] = _reading_rows(key.format(name), message, len(images[camera.name]), shape)
+        if camera.readings:
+            depth = camera.readings[0]
+            if (readings[depth] < 0).any() or (readings[depth] > DEEPEST).any():
+                raise UserError(f"{key.format(depth)} must be millimetres from 0 to {DEEPEST}.")
+            readings[depth] = readings[depth][..., None]
+    return readings
+
+
+def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple[int, ...]) -> np.ndarray:
+    if key not in message:
+        expected = "one pose [3, 4] from the world to the camera" if shape == POSE else "depth in millimetres"
+        raise UserError(f"The request lacks {key}: this policy reads {expected} beside every image of the camera.")
+    value = message[key]
+    rows = list(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else None
+    if rows is None or len(rows) != count:
+        got = type(value).__name__ if rows is None else f"{len(rows)} entries"
+        raise UserError(f"{key} must have one entry for each of {count} frames, got {got}.")
+    return np.stack([_reading(key, row, shape) for row in rows])
+
+
+def _reading(key: str, row: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        value = np.asarray(row)
+        fits = value.dtype.kind in "fiu" and value.shape in (shape, (*shape, 1))
+    except ValueError:  # rows of different lengths
+        fits = False
+    if not fits:
+        got = f"{value.dtype} {list(value.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
+        raise UserError(f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
+    numbers = value.astype(np.float32).reshape(shape)
+    if not np.isfinite(numbers).all():
+        raise UserError(f"{key} holds numbers that are not finite.")
+    return numbers
+
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 OPTIONS = "available_multi_choices"  # beside an observation, for policies that choose; the benchmark's name
-PICTURES = {"front": "observation/image", "wrist": "observation/wrist_image"}  # openpi's names of RoboMME's cameras
+IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}  # openpi's names of RoboMME's cameras
 MOST_GOAL = 4000  # characters
-SIDES = (8, 4096)  # pixels of a picture's side
+SIDES = (8, 4096)  # pixels of an image's side
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
 
 
@@ -33,7 +87,7 @@ class Reset:
 class AddBuffer:
     """Frames to remember, the current one included; nothing is chosen yet.
 
-    frames: t pictures [H, W, 3] uint8 of the camera that feeds memory.
+    frames: t images [H, W, 3] uint8 of the camera that feeds memory.
     exec_start: index of the episode's first execution frame; 0 where it is not said.
     states: what the robot felt at these frames, [t, s]; only a memory of its own motion needs them.
     """
@@ -47,16 +101,16 @@ class AddBuffer:
 class Infer:
     """Choose a chunk.
 
-    pictures: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind, those given.
+    images: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind, those given.
     frames: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
     first: whether the message begins an episode; None where the schema does not say.
     options: what can be chosen, for a policy that chooses; none where they stay as they were.
     states: what the robot felt at `frames`, [t, s].
-    seen: for a robot that reads more than pictures, everything its cameras delivered at the frames of this message, in
-        the form of `Episode.observe`: pictures by camera, depth and poses; `states` goes with it.
+    seen: for a robot that reads more than images, everything its cameras delivered at the frames of this message, in
+        the form of `Episode.observe`: images by camera, depth and poses; `states` goes with it.
     """
 
-    pictures: Mapping[str, np.ndarray]
+    images: Mapping[str, np.ndarray]
     state: np.ndarray
     goal: str
     subgoals: Mapping[str, str] = field(default_factory=dict)
@@ -64,7 +118,7 @@ class Infer:
     first: bool | None = None
     options: tuple[Option, ...] = ()
     states: np.ndarray | None = None
-    seen: Mapping[str, np.ndarray] | None = None
+    observed: Mapping[str, np.ndarray] | None = None
 
 
 Request = Reset | AddBuffer | Infer
@@ -75,24 +129,21 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
 
     Args:
         most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
-
-    Raises:
-        UserError: neither schema, a missing key, or a value of the wrong form; it names the key.
     """
     if not isinstance(message, dict):
         raise UserError(f"A request is a map, got {type(message).__name__}.")
-    answers = robot.action.answers
-    space = message.get("action_space", answers)
-    if space != answers:
-        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with {answers} only.")
+    space_name = robot.action.answers
+    space = message.get("action_space", space_name)
+    if space != space_name:
+        raise UserError(f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
     if robot.action.of_pose and "action_space" not in message:
         raise UserError(
-            f"This policy answers with differences to the tool's pose at each step, which whoever executes them adds "
-            f"to where the tool is then: say action_space={answers!r} in the request to show that you do."
+            f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
+            f"send action_space={space_name!r} in the request to confirm it."
         )
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames, robot)
@@ -143,18 +194,18 @@ def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) ->
 
 
 def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
-    keys = {name: PICTURES.get(name, f"observation/{name}") for name in robot.camera_names}
-    pictures = {name: _picture(key, _get(message, key)) for name, key in keys.items()}
+    keys = {name: IMAGE_KEYS.get(name, f"observation/{name}") for name in robot.camera_names}
+    images = {name: _image(key, _get(message, key)) for name, key in keys.items()}
     state = _numbers("observation/state", _array(message, "observation/state"))
     if state.shape != (robot.state.width,):
         raise UserError(f"observation/state must be [{robot.state.width}], got {list(state.shape)}.")
     goal, options = _text("prompt", _get(message, "prompt")), _options(message, robot)
     if not robot.readings:
-        return Infer(pictures, state, goal, _subgoals(message), options=options)
-    given = {f"observation/{name}": [_get(message, f"observation/{name}")] for name in robot.readings}
-    seen = {name: picture[None] for name, picture in pictures.items()}
-    seen |= read_beside(robot, seen, given, "observation/{}")
-    return Infer(pictures, state, goal, _subgoals(message), options=options, states=state[None], seen=seen)
+        return Infer(images, state, goal, _subgoals(message), options=options)
+    readings = {f"observation/{name}": [_get(message, f"observation/{name}")] for name in robot.readings}
+    frames = {name: image[None] for name, image in images.items()}
+    frames |= read_beside(robot, frames, readings, "observation/{}")
+    return Infer(images, state, goal, _subgoals(message), options=options, states=state[None], observed=frames)
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
@@ -173,14 +224,14 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
     if not isinstance(first, bool | np.bool_):
         raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
     goal = _text("task_goal", _get(message, "task_goal"))
-    states = np.stack([benchmark_state(*felt) for felt in zip(joints, grippers, strict=True)])
-    pictures = {name: view[-1] for name, view in views.items()}
+    states = np.stack([benchmark_state(*proprio) for proprio in zip(joints, grippers, strict=True)])
+    images = {name: view[-1] for name, view in views.items()}
     frames, options = views[robot.memory_camera], _options(message, robot)
-    seen = None
+    frame_views = None
     if robot.readings:
-        seen = {name: np.stack(view) for name, view in views.items()}
-        seen |= read_beside(robot, seen, message, "{}_list")
-    return Infer(pictures, states[-1], goal, _subgoals(message), frames, bool(first), options, states, seen)
+        frame_views = {name: np.stack(view) for name, view in views.items()}
+        frame_views |= read_beside(robot, frame_views, message, "{}_list")
+    return Infer(images, states[-1], goal, _subgoals(message), frames, bool(first), options, states, frame_views)
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:
@@ -227,39 +278,39 @@ def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
         rows = list(rows) if rows.ndim else None
     if not isinstance(rows, list):
         raise UserError(f"{key} must be a list of arrays [{size}].")
-    found = [_numbers(key, _array({key: row}, key)) for row in rows]
-    for row in found:
+    arrays = [_numbers(key, _array({key: row}, key)) for row in rows]
+    for row in arrays:
         if row.shape != (size,):
             raise UserError(f"{key} must hold arrays [{size}], got {list(row.shape)}.")
-    return found
+    return arrays
 
 
 def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
     if not isinstance(frames, list):
-        raise UserError(f"{key} must be a list of uint8 pictures [height, width, 3].")
+        raise UserError(f"{key} must be a list of uint8 images [height, width, 3].")
     if not 1 <= len(frames) <= most:
         raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
     for frame in frames:
-        _picture(key, frame)
+        _image(key, frame)
     shapes = {frame.shape for frame in frames}
     if len(shapes) > 1:
-        raise UserError(f"All pictures of {key} need one size, got {sorted(shapes)[:3]}.")
+        raise UserError(f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
 
 
-def _picture(key: str, picture: Any) -> np.ndarray:
-    if not isinstance(picture, np.ndarray):
-        raise UserError(f"{key} must be a uint8 picture [height, width, 3], got {type(picture).__name__}.")
-    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[-1] != 3:
-        got = f"{picture.dtype} {list(picture.shape)}"
-        raise UserError(f"{key} must be a uint8 picture [height, width, 3], got {got}.")
-    if not all(SIDES[0] <= side <= SIDES[1] for side in picture.shape[:2]):
-        raise UserError(f"{key}: a picture's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(picture.shape[:2])}.")
-    if max(picture.shape[:2]) > 8 * min(picture.shape[:2]):
-        raise UserError(f"{key}: a picture of {list(picture.shape[:2])} is too narrow to be scaled into a square.")
-    return picture
+def _image(key: str, image: Any) -> np.ndarray:
+    if not isinstance(image, np.ndarray):
+        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {type(image).__name__}.")
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[-1] != 3:
+        got = f"{image.dtype} {list(image.shape)}"
+        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {got}.")
+    if not all(SIDES[0] <= side <= SIDES[1] for side in image.shape[:2]):
+        raise UserError(f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(image.shape[:2])}.")
+    if max(image.shape[:2]) > 8 * min(image.shape[:2]):
+        raise UserError(f"{key}: an image of {list(image.shape[:2])} is too narrow to be scaled into a square.")
+    return image
 
 
 def _text(key: str, value: Any) -> str:

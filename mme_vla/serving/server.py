@@ -7,22 +7,45 @@ from contextlib import suppress
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
+from mme_vla.embodiment import Embodiment, Option
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import missing_extra
 from mme_vla.policy.base import Policy
-from mme_vla.processing.subgoal_text import subgoal_kind
+from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import pack
-from mme_vla.serving.counters import ServerStats
-from mme_vla.serving.engine import Engine
-from mme_vla.serving.listen import listen
-from mme_vla.serving.settings import ServeSettings
-from mme_vla.serving.warmup import warm_up
+from mme_vla.serving.engine import Engine, ServerStats
+from mme_vla.serving.settings import ServeSettings, listen
+
+
+def warm_up(policy: Policy, settings: ServeSettings) -> None:
+    """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
+    robot, count = policy.embodiment, settings.encode_chunk
+    episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
+    for episode in episodes:
+        episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
+        episode.observe(_nothing(robot, count), np.zeros((count, robot.state.width), np.float32))
+    policy.act(episodes[:1], settings.flow_steps)
+    policy.act(episodes, settings.flow_steps)
+
+
+def _nothing(robot: Embodiment, count: int) -> dict[str, np.ndarray]:
+    """Black images of every camera, and a wall at no distance where it reads depth."""
+    frames: dict[str, np.ndarray] = {}
+    for camera in robot.cameras:
+        frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
+        beside = (np.zeros((count, SIDE, SIDE, 1), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)))
+        frames |= dict(zip(camera.readings, beside, strict=False))
+    return frames
+
 
 try:
     import uvicorn
 
     from mme_vla.serving.app import make_app
-    from mme_vla.serving.connections import Connections, HttpProtocol, WebSocketProtocol
-    from mme_vla.serving.http_sessions import HttpSessions
+    from mme_vla.serving.connections import Connections, timed_protocol
+    from mme_vla.serving.session import HttpSessions
 except ImportError as error:
     raise missing_extra("Serving", "serve") from error
 
@@ -45,7 +68,7 @@ class PolicyServer:
 
     def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
         policy.require_processor().require_stats()
-        settings.check_robot(policy.embodiment, policy.require_processor().past_actions)
+        settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
@@ -56,11 +79,7 @@ class PolicyServer:
         self._uvicorn: uvicorn.Server | None = None
 
     async def start(self) -> None:
-        """Warm up, then accept clients.
-
-        Raises:
-            UserError: the port is taken, or the address is not one of this machine.
-        """
+        """Warm up, then accept clients."""
         begun = time.perf_counter()
         await self.engine.call(lambda: warm_up(self.engine.policy, self.settings))
         logger.info("warmed up in %.1f s", time.perf_counter() - begun)
@@ -69,8 +88,7 @@ class PolicyServer:
         config = self._config()
         config.load()
         self._uvicorn = uvicorn.Server(config)
-        # `serve()` would take the process's signals; they belong to whoever started this server.
-        self._uvicorn.lifespan = config.lifespan_class(config)
+        self._uvicorn.lifespan = config.lifespan_class(config)  # `serve()` would take over the signals of the process
         await self._uvicorn.startup(sockets=[bound])
         self.port = bound.getsockname()[1]
         for work in (self._log_regularly(), self.connections.watch(), self.sessions.forget_silent()):
@@ -80,25 +98,25 @@ class PolicyServer:
         limits = self.settings.limits
         return uvicorn.Config(
             make_app(self.engine, self.settings, pack(self.metadata), self.connections, self.sessions),
-            http=HttpProtocol,
-            ws=WebSocketProtocol,
+            http=timed_protocol(self.connections),
+            ws="websockets-sansio",
             ws_max_size=limits.message_bytes,
             ws_per_message_deflate=False,
             ws_ping_timeout=limits.pong_s,
             h11_max_incomplete_event_size=HEAD,
             timeout_keep_alive=int(limits.idle_s) + 60,  # `Connections` is stricter
             timeout_graceful_shutdown=1,
-            lifespan="on",
+            lifespan="off",
             log_config=None,
-            log_level=logging.CRITICAL + 1,  # a failed handshake is the client's affair, not worth a traceback
+            log_level=logging.CRITICAL + 1,  # failed handshakes of clients print no traceback
             access_log=False,
-            proxy_headers=False,  # a session belongs to the address that connects, whatever it says of itself
+            proxy_headers=False,  # a session belongs to the address that connects, not to a header
             server_header=False,
             date_header=False,
         )
 
     async def stop(self) -> None:
-        """Accept nobody, finish the requests that are running, close every connection with a reason."""
+        """Refuse new clients, finish the requests that are running, close every connection with a reason."""
         connections, server = self.connections, self._uvicorn
         connections.stopping = True
         for task in self._background:
@@ -106,14 +124,14 @@ class PolicyServer:
         if server is not None:
             for listener in server.servers:
                 listener.close()
-            connections.let_idle_go(1001, STOPPING)
+            connections.close_idle(1001, STOPPING)
             with suppress(TimeoutError):
                 async with asyncio.timeout(self.settings.limits.stop_s):
-                    while connections.open:
+                    while any(connection.is_open for connection in connections.open.values()):
                         await asyncio.sleep(0.02)
-            connections.abort()
             await server.shutdown()
-        self.sessions.kept.clear()
+            connections.abort()
+        self.sessions.entries.clear()
         await self.engine.stop()
 
     async def _log_regularly(self) -> None:
@@ -126,7 +144,7 @@ class PolicyServer:
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
-    """What a client is told when it connects."""
+    """The first message to a client."""
     limits = settings.limits
     return {
         "server": "mme_vla",
@@ -140,7 +158,7 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "state_dim": policy.embodiment.state.width,
         "action_space": policy.embodiment.action.answers,
         "action_dim": policy.embodiment.action.width,
-        "horizon": policy.horizon - policy.skipped,
+        "horizon": policy.horizon - policy.require_processor().samples.window + 1,
         "execute": settings.executed(policy.embodiment),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),

@@ -1,30 +1,54 @@
-"""What a server may be told, checked before it starts."""
+"""Settings of a server, checked before it starts."""
 
+import ipaddress
+import socket
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal, Self
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import Positive, PositiveInt, Range, read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.embodiment.actions import DELTA
-from mme_vla.errors import UserError, did_you_mean
-from mme_vla.serving.listen import is_local
+from mme_vla.errors import UserError
 
-ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", DELTA)
+
+def is_local(host: str) -> bool:
+    """Whether a host name or address is this machine's own loopback."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket bound to this address."""
+    if not 0 <= port < 2**16:
+        raise UserError(f"port={port!r} is no port; choose 0 (any free one) to 65535.")
+    bound = None
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        bound = socket.socket(family, kind, protocol)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        bound.listen()
+    except OSError as error:
+        if bound is not None:
+            bound.close()
+        raise UserError(f"Cannot listen at {host}, port {port} ({error.strerror}); choose others.") from None
+    return bound
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one client may ask for, and for how long. Seconds, unless the name says otherwise."""
+    """Limits of one client, in seconds unless the name says otherwise."""
 
-    message_mib: float = 2048
-    frames: int = 4096
-    connections: int = 64
-    send_s: float = 60
-    receive_s: float = 120
-    pong_s: float = 600
-    idle_s: float = 3600
-    stop_s: float = 30
+    message_mib: Positive = 2048
+    frames: PositiveInt = 4096
+    connections: PositiveInt = 64
+    send_s: Positive = 60
+    receive_s: Positive = 120
+    pong_s: Positive = 600
+    idle_s: Positive = 3600
+    stop_s: Positive = 30
 
     @property
     def message_bytes(self) -> int:
@@ -33,51 +57,34 @@ class Limits:
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """How to serve; the keys and their meaning are those of configs/serve.yaml.
-
-    Raises:
-        UserError: a value that cannot work, named with its key.
-    """
+    """How to serve; the keys and their meaning are those of configs/serve.yaml."""
 
     host: str = "127.0.0.1"
-    port: int = 8001
+    port: Annotated[int, Range(0, 65535)] = 8001
     api_key: str | None = field(default=None, repr=False)
     require_key: bool = False
-    action_space: str | None = None
-    execute: int | None = None
-    flow_steps: int | None = None
+    action_space: Literal["joint_angle", "ee_pose", "waypoint", "ee_delta"] | None = None
+    execute: PositiveInt | None = None
+    flow_steps: PositiveInt | None = None
     seed: int = 42
-    max_batch: int = 16
-    encode_chunk: int = 32
-    log_every_s: float = 60
+    max_batch: PositiveInt = 16
+    encode_chunk: PositiveInt = 32
+    log_every_s: Positive = 60
     limits: Limits = Limits()
 
     def __post_init__(self) -> None:
-        if self.action_space is not None and self.action_space not in ACTION_SPACES:
-            raise UserError(f"action_space={self.action_space!r}. {did_you_mean(self.action_space, ACTION_SPACES)}")
         key = self.api_key
-        if key is not None and not (
-            isinstance(key, str) and key.isascii() and key.isprintable() and key.strip() == key != ""
-        ):
-            raise UserError("api_key must be a text of plain ASCII without blanks around it; null asks for none.")
+        if key is not None and not (key.isascii() and key.isprintable() and key.strip() == key != ""):
+            raise UserError("api_key must be plain ASCII text without blanks around it; null for no key.")
         if self.require_key and key is None:
             raise UserError(
-                "require_key=true, and there is no api_key: set the environment variable MME_VLA_API_KEY, or say "
+                "require_key=true, and there is no api_key: set the environment variable MME_VLA_API_KEY, or "
                 "require_key=false to serve every client that reaches the port."
             )
-        if not isinstance(self.port, int) or not 0 <= self.port < 65536:
-            raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
-        given = [name for name in ("execute", "flow_steps") if getattr(self, name) is not None]
-        for name in ("max_batch", "encode_chunk", *given):
-            _positive(name, getattr(self, name), whole=True)
-        _positive("log_every_s", self.log_every_s)
-        for spec in fields(self.limits):
-            whole = spec.name in ("frames", "connections")
-            _positive(f"limits.{spec.name}", getattr(self.limits, spec.name), whole)
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> Self:
-        """Build from a composed configuration; keys of other purposes are left aside."""
+        """Read a composed configuration; keys of other purposes are ignored."""
         # An empty environment variable, as compose files leave it, is no key.
         return read_section(cls, {**config, "api_key": config.get("api_key") or None}, others=True)
 
@@ -86,11 +93,7 @@ class ServeSettings:
         return min(self.execute or robot.action.execute, robot.action.horizon)
 
     def check_robot(self, robot: Embodiment, past_actions: int = 0) -> None:
-        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this.
-
-        Raises:
-            UserError: it answers in another action space, or would have to know what no request tells.
-        """
+        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this."""
         if past_actions and robot.action.frames is None:
             raise UserError(
                 f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
@@ -98,17 +101,11 @@ class ServeSettings:
             )
         if self.action_space not in (None, robot.action.answers):
             raise UserError(
-                f"action_space={self.action_space}: this policy answers with {robot.action.answers}, "
-                f"{robot.action.width} numbers an action, and nothing is converted. Ask the client for that."
+                f"action_space={self.action_space}: this policy returns {robot.action.answers}, "
+                f"{robot.action.width} numbers an action, and nothing is converted. The client has to convert."
             )
 
     @property
     def local_only(self) -> bool:
         """Whether only programs on this machine can connect."""
         return is_local(self.host)
-
-
-def _positive(name: str, value: Any, whole: bool = False) -> None:
-    kinds = int if whole else (int, float)
-    if isinstance(value, bool) or not isinstance(value, kinds) or not value > 0:
-        raise UserError(f"{name}={value!r} must be a positive {'whole ' if whole else ''}number.")

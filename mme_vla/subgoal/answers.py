@@ -1,9 +1,9 @@
-"""What a predictor remembers of its own answers: subgoals in words, keyframes, and when to hold on to an answer."""
+"""State that predictors keep of an episode: past subgoals, keyframes, and how long a subgoal is held."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from mme_vla.subgoal.words.parsing import Parsed, Point
+from mme_vla.subgoal.text import Parsed, Point
 
 HOLD = {"ButtonUnmask": 90, "PickHighlight": 90}
 _HOLD_BY_SUBGOAL = {"ButtonUnmaskSwap": {"press the first button": 100, "press the second button": 250}}
@@ -13,7 +13,7 @@ _HOLD_BY_SUBGOAL = {"ButtonUnmaskSwap": {"press the first button": 100, "press t
 class SubgoalHistory:
     """The subgoals so far, each once until another one comes.
 
-    Two answers are the same when their words are, whatever their points; the first answer's points are kept.
+    Replies with equal texts are the same, whatever their points; the first one's points are kept.
     """
 
     entries: list[str] = field(default_factory=list)
@@ -57,11 +57,11 @@ def merge_keyframes(frames: Sequence[int], distance: int = 8) -> list[int]:
     return [group[len(group) // 2] for group in groups]
 
 
-def recent_frames(newest: int, asked_before: bool, count: int = 8, stride: int = 2) -> list[int]:
+def recent_frames(newest: int, queried_before: bool, count: int = 8, stride: int = 2) -> list[int]:
     """Indices of MemER's recent frames: `count` of them, `stride` apart, ending at `newest`; one at the first call.
 
     Before the episode is long enough the list is shorter, never padded.
     """
-    if not asked_before:
+    if not queried_before:
         return [newest]
     return [i for i in range(newest - (count - 1) * stride, newest + 1, stride) if i >= 0]

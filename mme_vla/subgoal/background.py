@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.models.threads import start
+from mme_vla.subgoal.models.api import start
 
 GRACE = 2.0  # seconds that closing waits: better not to end the process while a local model computes
 
 
 class BackgroundEpisode(SubgoalEpisode):
-    """An episode as the policy sees it; the predictor's own (`inner`) stands still while a model answers for it."""
+    """An episode as the policy sees it; the predictor's own (`inner`) waits while a model computes its subgoal."""
 
     def __init__(self, inner: SubgoalEpisode) -> None:
         super().__init__(inner.goal, inner.video, inner.task)
@@ -33,7 +33,7 @@ class BackgroundEpisode(SubgoalEpisode):
         self._news.append(lambda: self.inner.observe(frames, info))
 
     def catch_up(self) -> SubgoalEpisode:
-        """Hand on what was seen meanwhile; only while no model answers for this episode."""
+        """Pass on the frames since then; only while no model computes for this episode."""
         for tell in self._news:
             tell()
         self._news.clear()
@@ -45,7 +45,7 @@ class BackgroundPredictor(SubgoalPredictor):
 
     Only the first subgoal of an episode is waited for. Later a question goes out as soon as the thread is free, for all
     waiting episodes together, and its answer is used from the next chunk on; one that came due while the thread was
-    busy goes out once it is free. What comes out therefore depends on how fast the model answers.
+    busy goes out once it is free. The subgoals therefore depend on the speed of the model.
 
     Args:
         inner: the predictor. It is used by one thread at a time.
@@ -55,15 +55,15 @@ class BackgroundPredictor(SubgoalPredictor):
         super().__init__(inner.kind, inner.interval)
         self.inner, self.usage, self.settings = inner, inner.usage, inner.settings
         self.sees_video, self.sees_passing = inner.sees_video, inner.sees_passing
-        self._asked: list[BackgroundEpisode] = []
-        self._answers: Future[list[Subgoal]] | None = None
+        self._queried_episodes: list[BackgroundEpisode] = []
+        self._prediction: Future[list[Subgoal]] | None = None
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> BackgroundEpisode:
         """Begin an episode, see `SubgoalPredictor`."""
         return BackgroundEpisode(self.inner.start_episode(goal, video, task))
 
     def predict(self, episodes: Sequence[Any]) -> list[Subgoal]:
-        """The newest subgoals there are; asks for the episodes that are due if the thread is free.
+        """The newest subgoals there are; begins a prediction for the episodes that are due if the thread is free.
 
         Raises:
             Exception: what the predictor itself raised meanwhile.
@@ -82,26 +82,26 @@ class BackgroundPredictor(SubgoalPredictor):
 
     def close(self) -> None:
         """Drop what is under way and free the predictor."""
-        if self._answers is not None:
-            wait([self._answers], GRACE)
+        if self._prediction is not None:
+            wait([self._prediction], GRACE)
         self.inner.close()
 
     def _ask(self, episodes: Sequence[BackgroundEpisode]) -> None:
-        if self._answers is not None:
+        if self._prediction is not None:
             return
         # What was answered just now for the current frame need not be asked again.
-        moved = [e for e in episodes if not e.answered or e.inner.frames_seen < e.frames_seen]
-        due = [episode for episode in moved if self.inner.due(episode.catch_up()) or not episode.answered]
+        advanced = [e for e in episodes if not e.answered or e.inner.n_observed_frames < e.n_observed_frames]
+        due = [episode for episode in advanced if self.inner.due(episode.catch_up()) or not episode.answered]
         if due:
-            self._asked = due
+            self._queried_episodes = due
             inner = [episode.inner for episode in due]
-            self._answers = start(lambda: self.inner.predict(inner))
+            self._prediction = start(lambda: self.inner.predict(inner))
 
     def _collect(self, wait: bool = False) -> None:
-        if self._answers is None or not (wait or self._answers.done()):
+        if self._prediction is None or not (wait or self._prediction.done()):
             return
-        answers, self._answers = self._answers.result(), None
-        for episode, subgoal in zip(self._asked, answers, strict=True):
+        subgoals, self._prediction = self._prediction.result(), None
+        for episode, subgoal in zip(self._queried_episodes, subgoals, strict=True):
             episode.subgoal, episode.answered, episode.fresh = subgoal, True, True
-            episode.asked_step = episode.inner.asked_step
-        self._asked = []
+            episode.query_step = episode.inner.query_step
+        self._queried_episodes = []

@@ -14,30 +14,29 @@ import numpy as np
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.words.parsing import MalformedAnswer, Parsed, Point
-from mme_vla.subgoal.words.prompts import KINDS
+from mme_vla.subgoal.text import KINDS, MalformedReply, Parsed, Point
 
 log = logging.getLogger(__name__)
 PROBLEMS = ("malformed", "empty", "refused", "failed")
-_PLAIN = (str, int, float, bool, list, dict, type(None))  # the values of a configuration
+_CONFIG_TYPES = (str, int, float, bool, list, dict, type(None))  # the values of a configuration
 
 
 @dataclass(frozen=True)
 class Subgoal:
     """A subgoal for the policy, and how it came about.
 
-    text: in words, points as `<row, column>` in pixels of the front picture; None while there has been none (the
+    text: in words, points as `<row, column>` in pixels of the front image; None while there has been none (the
         policy's prompt is then the plain one).
     points: those points in order, (row, column).
-    asked: whether a model was asked for this one; False for one that is kept.
-    answer: what the model said, word for word; empty if none was asked.
+    queried: whether a model was asked for this one; False for one that is kept.
+    reply: of the model, unchanged; empty if none was asked.
     problem: why the answer could not be used (one of `PROBLEMS`), empty if it could. The last subgoal is then kept.
     """
 
     text: str | None
     points: tuple[Point, ...] = ()
-    asked: bool = False
-    answer: str = ""
+    queried: bool = False
+    reply: str = ""
     problem: str = ""
 
 
@@ -45,8 +44,8 @@ class Subgoal:
 class Usage:
     """What a predictor has done so far, over all episodes.
 
-    calls: questions that were answered by a model (the cache's answers are counted apart). tokens: as the model counts
-    them. problems: unusable answers by kind. cost: US dollars.
+    calls: questions to a model (replies from the cache are counted apart). tokens: as the model counts
+    them. problems: unusable replies by kind. cost: US dollars.
     """
 
     calls: int = 0
@@ -68,26 +67,26 @@ class SubgoalEpisode:
 
     goal: the task in words, lower-case as in training. task: its name, empty if unknown.
     video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
-    frame: the current front picture [H, W, 3] uint8. step: actions executed so far.
-    info: what the environment reports beside the picture. subgoal: the last prediction.
+    frame: the current front image [H, W, 3] uint8. step: actions executed so far.
+    info: what the environment reports beside the image. subgoal: the last prediction.
     asked_step: the step of the last question; None while there was none.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None = None, task: str = "") -> None:
         self.goal, self.task = goal.strip().lower(), task
         self.video = np.zeros((0, 1, 1, 3), np.uint8) if video is None else _checked(video, "video")
-        self.frames_seen = 0
+        self.n_observed_frames = 0
         self.info: Mapping[str, Any] = {}
         self.subgoal = Subgoal(None)
-        self.asked_step: int | None = None
+        self.query_step: int | None = None
         self._frame: np.ndarray | None = None
 
     def skip(self, count: int) -> None:
-        """Let execution frames pass that were not drawn, before the next `observe`.
+        """Count execution frames that were not rendered, before the next `observe`.
 
-        Only where nobody looks at them (`SubgoalPredictor.sees_passing`).
+        Only for predictors that do not read them (`SubgoalPredictor.sees_passing`).
         """
-        self.frames_seen += count
+        self.n_observed_frames += count
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
         """Take execution frames [n, H, W, 3] uint8 in order, each once, the current one last.
@@ -95,28 +94,21 @@ class SubgoalEpisode:
         Args:
             frames: of the front camera. The first call brings the first frame that is no video.
             info: the environment's report on the last of them (the oracle reads its subgoal there).
-
-        Raises:
-            UserError: frames of another form.
         """
         frames = _checked(frames, "frames")
         if len(frames):
             self._frame = frames[-1]
-        self.frames_seen += len(frames)
+        self.n_observed_frames += len(frames)
         self.info = info or {}
 
     @property
     def step(self) -> int:
         """Actions executed so far: one frame each after the first."""
-        return max(self.frames_seen - 1, 0)
+        return max(self.n_observed_frames - 1, 0)
 
     @property
     def frame(self) -> np.ndarray:
-        """The current front picture.
-
-        Raises:
-            UserError: nothing was observed yet.
-        """
+        """The current front image."""
         if self._frame is None:
             raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
         return self._frame
@@ -134,7 +126,7 @@ class SubgoalPredictor:
     """
 
     sees_video = True
-    """Whether `start_episode` has to be given the pictures of a conditioning video."""
+    """Whether `start_episode` has to be given the images of a conditioning video."""
     sees_passing = True
     """Whether frames are looked at besides those at which `predict` is called."""
 
@@ -162,52 +154,48 @@ class SubgoalPredictor:
         An answer that cannot be used is counted in `usage.problems` and the episode keeps its last subgoal.
         """
         due = [episode for episode in episodes if self.due(episode)]
-        for episode, subgoal in zip(due, self.answer(due) if due else [], strict=True):
-            episode.subgoal, episode.asked_step = subgoal, episode.step
-        asked = {id(episode) for episode in due}
-        return [e.subgoal if id(e) in asked else Subgoal(e.subgoal.text, e.subgoal.points) for e in episodes]
+        for episode, subgoal in zip(due, self.predict_due(due) if due else [], strict=True):
+            episode.subgoal, episode.query_step = subgoal, episode.step
+        queried = {id(episode) for episode in due}
+        return [e.subgoal if id(e) in queried else Subgoal(e.subgoal.text, e.subgoal.points) for e in episodes]
 
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether the episode's subgoal is to be asked for now: never yet, or a multiple of the interval was passed."""
-        return episode.asked_step is None or self.due_step(episode) > episode.asked_step
+        return episode.query_step is None or self.due_step(episode) > episode.query_step
 
     def due_step(self, episode: SubgoalEpisode) -> int:
         """The step at which the newest question was due, however late the prediction comes."""
         return episode.step - episode.step % self.interval
 
-    def answer(self, episodes: Sequence[Any]) -> list[Subgoal]:
+    def predict_due(self, episodes: Sequence[Any]) -> list[Subgoal]:
         """Ask for these episodes, all at once where that is possible."""
         raise NotImplementedError
 
-    def accepted(self, parsed: Parsed, answer: str) -> Subgoal:
+    def accepted(self, parsed: Parsed, reply: str) -> Subgoal:
         """A subgoal that a model gave."""
-        return Subgoal(parsed.text, parsed.points, asked=True, answer=answer)
+        return Subgoal(parsed.text, parsed.points, queried=True, reply=reply)
 
-    def kept(self, episode: SubgoalEpisode, problem: str, answer: str = "", reason: str = "") -> Subgoal:
+    def unchanged(self, episode: SubgoalEpisode, problem: str, reply: str = "", reason: str = "") -> Subgoal:
         """The episode's last subgoal, after an answer that cannot be used; counts and reports the problem."""
         self.usage.problems[problem] += 1
         log.warning("Subgoal answer unusable (%s) at step %d, the last one is kept: %s", problem, episode.step, reason)
-        return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=answer, problem=problem)
+        return Subgoal(episode.subgoal.text, episode.subgoal.points, queried=True, reply=reply, problem=problem)
 
     def close(self) -> None:
         """Give back what the predictor holds."""
 
 
-def problem_of(answer: str, error: MalformedAnswer) -> tuple[str, str]:
-    """Which of `PROBLEMS` an unusable answer is, and the reason in words."""
-    return ("malformed" if answer.strip() else "empty"), str(error)
+def problem_of(reply: str, error: MalformedReply) -> tuple[str, str]:
+    """Which of `PROBLEMS` an unusable reply is, and the reason."""
+    return ("malformed" if reply.strip() else "empty"), str(error)
 
 
 def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None:
-    """Build from the section `subgoal` of a configuration, or return None where there is none.
-
-    Raises:
-        UserError: an unknown predictor or option.
-    """
+    """Build from the section `subgoal` of a configuration, or return None where there is none."""
     if not config or config.get("name") in (None, "none"):
         return None
     built: SubgoalPredictor = SUBGOALS.build(config)
-    built.settings = {key: value for key, value in config.items() if key != "name" and isinstance(value, _PLAIN)}
+    built.settings = {key: value for key, value in config.items() if key != "name" and isinstance(value, _CONFIG_TYPES)}
     return built
 
 

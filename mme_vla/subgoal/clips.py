@@ -1,4 +1,4 @@
-"""Pictures and videos as models look at them: which frames of a video, out of memory or out of a file."""
+"""Images and videos as models read them: frames sampled from a video in memory or in a file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,31 +7,27 @@ from typing import Any, Self
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.files import decoding, require_file
-from mme_vla.files.media import FPS
+from mme_vla.utils import decoding, require_file
+from mme_vla.utils.media import FPS
 
-VIDEO_FRAMES = 10  # that a model looks at, at most
+VIDEO_FRAMES = 10  # of a video, at most
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
-"""How films that models look at are compressed (`mme_vla.files.media.Film`): finer than those for people."""
+"""Compression of videos for models (`mme_vla.utils.media`), finer than that of videos for people."""
 
 _REMEDY = "Build the training data again."
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read a picture as [H, W, 3] uint8.
-
-    Raises:
-        UserError: it is missing or damaged.
-    """
+    """Read an image as [H, W, 3] uint8."""
     from PIL import Image
 
-    with decoding(require_file(path, "a picture"), "a picture", _REMEDY), Image.open(path) as image:
+    with decoding(require_file(path, "an image"), "an image", _REMEDY), Image.open(path) as image:
         return np.array(image.convert("RGB"))
 
 
 @dataclass(frozen=True)
 class Clip:
-    """What a Qwen model looks at of a video.
+    """Frames of a video that a Qwen model reads.
 
     frames: [n, H, W, 3] uint8. indices: [n] their places in the video. length: of the whole video, in frames.
     """
@@ -48,19 +44,15 @@ class Clip:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Sample a file; frames that are not looked at are decoded but not turned into pictures.
-
-        Raises:
-            UserError: it is missing or damaged.
-        """
+        """Sample a file; frames that are not looked at are decoded but not turned into images."""
         import av
 
         with decoding(require_file(path, "a video"), "a video", _REMEDY), av.open(str(path)) as container:
             length = container.streams.video[0].frames
             indices = sample_video(length)
-            wanted = set(indices.tolist())
+            required = set(indices.tolist())
             decoded = enumerate(container.decode(video=0))
-            frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in wanted]
+            frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in required]
         if len(frames) != len(indices) or len({frame.shape for frame in frames}) != 1:
             raise UserError(f"{path} is damaged: it announces {length} frames. {_REMEDY}")
         return cls(np.stack(frames), indices, length)
@@ -69,10 +61,10 @@ class Clip:
 def sample_video(
     length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = VIDEO_FRAMES
 ) -> np.ndarray:
-    """Which frames of a video a Qwen model looks at: `rate` a second, within bounds, an even number of them.
+    """Indices of the frames of a video that a Qwen model reads: `rate` a second, within bounds, an even number of them.
 
     Args:
-        length: frames of the video. fps: of the video. rate: frames looked at a second.
+        length: frames of the video. fps: of the video. rate: frames a second.
         least, most: bounds of their number; a shorter video has fewer.
 
     Returns:

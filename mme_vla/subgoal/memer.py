@@ -11,36 +11,35 @@ from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import Question
 from mme_vla.subgoal.qwenvl import VLMPredictor
-from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_memer
-from mme_vla.subgoal.words.prompts import memer_system, memer_user
+from mme_vla.subgoal.text import MalformedReply, memer_system, memer_user, parse_memer
 
 
 class MemerEpisode(SubgoalEpisode):
     """An episode, its keyframes, and as many frames back as the next question may show.
 
-    keyframes: frame number (from the first execution frame) → picture.
+    keyframes: frame number (from the first execution frame) → image.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str, reach: int) -> None:
         super().__init__(goal, video, task)
         self.keyframes: dict[int, np.ndarray] = {}
-        self.asked = False
+        self.queried = False
         self._recent: dict[int, np.ndarray] = {}
         self._reach = reach
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
         """Take frames, see `SubgoalEpisode`; only the last ones are kept."""
-        first = self.frames_seen
+        first = self.n_observed_frames
         super().observe(frames, info)
         self._recent |= {first + i: frame for i, frame in enumerate(frames)}
-        self._recent = {t: frame for t, frame in self._recent.items() if t >= self.frames_seen - self._reach}
+        self._recent = {t: frame for t, frame in self._recent.items() if t >= self.n_observed_frames - self._reach}
 
     def recent(self, count: int, stride: int) -> dict[int, np.ndarray]:
         """The recent frames the next question shows, by number."""
-        wanted = recent_frames(self.step, self.asked, count, stride)
-        return {t: self._recent[t] for t in wanted}
+        indices = recent_frames(self.step, self.queried, count, stride)
+        return {t: self._recent[t] for t in indices}
 
-    def remember(self, frames: Mapping[int, np.ndarray], distance: int) -> None:
+    def add_keyframes(self, frames: Mapping[int, np.ndarray], distance: int) -> None:
         """Add keyframes and thin them out."""
         known = self.keyframes | dict(frames)
         self.keyframes = {t: known[t] for t in merge_keyframes(list(known), distance)}
@@ -78,23 +77,23 @@ class Memer(VLMPredictor):
         recent = episode.recent(self.recent, self.stride)
         video = len(episode.video) > 0
         user = memer_user(episode.goal, len(episode.keyframes), len(recent), video)
-        pictures = [*episode.keyframes.values(), *recent.values()]
-        return Question(memer_system(), user, pictures, [Clip.of(episode.video)] if video else [])
+        images = [*episode.keyframes.values(), *recent.values()]
+        return Question(memer_system(), user, images, [Clip.of(episode.video)] if video else [])
 
-    def answer(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
+    def predict_due(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
         """Ask for all of them in one batch."""
         _ = [episode.frame for episode in episodes]  # every episode has seen something
-        answers = self.ask([self.question(episode) for episode in episodes])
-        return [self._read(e, answer.text) for e, answer in zip(episodes, answers, strict=True)]
+        completions = self.ask([self.question(episode) for episode in episodes])
+        return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
 
-    def _read(self, episode: MemerEpisode, answer: str) -> Subgoal:
+    def _read(self, episode: MemerEpisode, reply: str) -> Subgoal:
         recent = episode.recent(self.recent, self.stride)
-        episode.asked = True
+        episode.queried = True
         try:
-            parsed, positions = parse_memer(answer, len(recent))
-        except MalformedAnswer as error:
-            problem, reason = problem_of(answer, error)
-            return self.kept(episode, problem, answer, reason)
+            parsed, positions = parse_memer(reply, len(recent))
+        except MalformedReply as error:
+            problem, reason = problem_of(reply, error)
+            return self.unchanged(episode, problem, reply, reason)
         numbers = list(recent)
-        episode.remember({numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance)
-        return self.accepted(parsed, answer)
+        episode.add_keyframes({numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance)
+        return self.accepted(parsed, reply)

@@ -6,7 +6,7 @@ from typing import Any
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.words.parsing import points_of
+from mme_vla.subgoal.text import points_of
 
 
 @SUBGOALS.register("oracle")
@@ -19,12 +19,8 @@ class Oracle(SubgoalPredictor):
 
     sees_video = sees_passing = False
 
-    def answer(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
-        """Look the texts up.
-
-        Raises:
-            UserError: the environment reports none.
-        """
+    def predict_due(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
+        """Look the texts up."""
         return [self._read(episode) for episode in episodes]
 
     def _read(self, episode: SubgoalEpisode) -> Subgoal:

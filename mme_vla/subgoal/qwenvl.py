@@ -1,4 +1,4 @@
-"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current picture, the video and its own past subgoals."""
+"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current image, the video and its own past subgoals."""
 
 import time
 from collections.abc import Sequence
@@ -11,13 +11,12 @@ from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
 from mme_vla.subgoal.clips import Clip
-from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
-from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_subgoal, write_boxes
-from mme_vla.subgoal.words.prompts import subgoal_system, subgoal_user
+from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
+from mme_vla.subgoal.text import MalformedReply, parse_subgoal, subgoal_system, subgoal_user, write_boxes
 
 
 class VLMPredictor(SubgoalPredictor):
-    """What `qwenvl` and `memer` share: one model that answers for all episodes at once.
+    """What `qwenvl` and `memer` share: one model for a batch of all episodes.
 
     Args:
         model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
@@ -43,15 +42,15 @@ class VLMPredictor(SubgoalPredictor):
         self.max_new_tokens = max_new_tokens
         self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=batch_size)
 
-    def ask(self, questions: Sequence[Question]) -> list[Answer]:
+    def ask(self, questions: Sequence[Question]) -> list[Completion]:
         """Answer and keep count."""
         started = time.perf_counter()
-        answers = self.vlm.generate(questions, self.max_new_tokens)
+        completions = self.vlm.generate(questions, self.max_new_tokens)
         self.usage.seconds += time.perf_counter() - started
-        self.usage.calls += len(answers)
-        self.usage.input_tokens += sum(answer.input_tokens for answer in answers)
-        self.usage.output_tokens += sum(answer.output_tokens for answer in answers)
-        return answers
+        self.usage.calls += len(completions)
+        self.usage.input_tokens += sum(completion.input_tokens for completion in completions)
+        self.usage.output_tokens += sum(completion.output_tokens for completion in completions)
+        return completions
 
 
 class QwenEpisode(SubgoalEpisode):
@@ -64,7 +63,7 @@ class QwenEpisode(SubgoalEpisode):
 
 @SUBGOALS.register("qwenvl")
 class QwenVL(VLMPredictor):
-    """Asks for the next subgoal, given all that were different from the one before.
+    """Predicts the next subgoal, given all that were different from the one before.
 
     Args:
         hold: keep the first subgoals of three tasks for a fixed time, as released.
@@ -83,8 +82,8 @@ class QwenVL(VLMPredictor):
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held is left out."""
         last = episode.subgoal.text
-        held = self.hold and last is not None and self.due_step(episode) <= hold_until(episode.task, last)
-        return super().due(episode) and not held
+        on_hold = self.hold and last is not None and self.due_step(episode) <= hold_until(episode.task, last)
+        return super().due(episode) and not on_hold
 
     def question(self, episode: QwenEpisode) -> Question:
         """What is asked at the current frame."""
@@ -97,16 +96,16 @@ class QwenVL(VLMPredictor):
             [Clip.of(episode.video)] if video else [],
         )
 
-    def answer(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
+    def predict_due(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
         """Ask for all of them in one batch."""
-        answers = self.ask([self.question(episode) for episode in episodes])
-        return [self._read(e, answer.text) for e, answer in zip(episodes, answers, strict=True)]
+        completions = self.ask([self.question(episode) for episode in episodes])
+        return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
 
-    def _read(self, episode: QwenEpisode, answer: str) -> Subgoal:
+    def _read(self, episode: QwenEpisode, reply: str) -> Subgoal:
         try:
-            parsed = parse_subgoal(answer)
-        except MalformedAnswer as error:
-            problem, reason = problem_of(answer, error)
-            return self.kept(episode, problem, answer, reason)
+            parsed = parse_subgoal(reply)
+        except MalformedReply as error:
+            problem, reason = problem_of(reply, error)
+            return self.unchanged(episode, problem, reply, reason)
         episode.history.add_parsed(parsed)
-        return self.accepted(parsed, answer)
+        return self.accepted(parsed, reply)

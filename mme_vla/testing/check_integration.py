@@ -24,7 +24,7 @@ def check_integration(name: str, memory: str = "framesamp", backbone: str = "tin
         options: the integration's own, as its YAML would give them.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown integration, memory or option, or a backbone that has no place for it.
     """
     sections = tiny_sections(f"{memory}_context", backbone)
@@ -32,17 +32,17 @@ def check_integration(name: str, memory: str = "framesamp", backbone: str = "tin
     if policy.integration.memory_width < 1:
         raise UserError(f"The integration {name!r} takes no memory: its memory_width is 0.")
     batch = random_batch(policy, batch=2, valid=64)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     assert batch.history is not None
     with torch.no_grad():
-        found = policy.encode_memory(batch.history)
-        assert found is not None
-        before = _loss(policy, batch, draws, found)
-        check_reach(policy, batch, draws, found, before)
+        memory_tokens = policy.encode_memory(batch.history)
+        assert memory_tokens is not None
+        before = _loss(policy, batch, draws, memory_tokens)
+        check_reach(policy, batch, draws, memory_tokens, before)
         print(f"{name}: the tokens of {memory} change the loss, their padding does not")
-        check_rows(policy, batch, draws, found, before)
+        check_rows(policy, batch, draws, memory_tokens, before)
         print(f"{name}: samples of one batch are independent")
-        check_sampling(policy, batch, found)
+        check_sampling(policy, batch, memory_tokens)
         print(f"{name}: sampling agrees with the pass that training makes")
     check_gradients(policy, batch, draws)
     print(f"{name}: every parameter of the memory and the integration gets a gradient")
@@ -65,40 +65,42 @@ def _loss(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: Mem
     assert batch.actions is not None
     rows = []
     for row in (slice(i, i + 1) for i in range(len(batch.prompt))):
-        seen = (batch.images[row], batch.image_mask[row], batch.prompt[row], batch.prompt_mask[row])
-        one = Batch(*seen, history=None, actions=batch.actions[row])
+        inputs = (batch.images[row], batch.image_mask[row], batch.prompt[row], batch.prompt_mask[row])
+        one = Batch(*inputs, history=None, actions=batch.actions[row])
         mine = memory.rows(row)
         rows.append(policy(one, {name: value[row] for name, value in draws.items()}, memory=mine)[0])
     return torch.stack(rows)
 
 
-def check_reach(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], found: MemoryTokens, before: Tensor) -> None:
+def check_reach(
+    policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor
+) -> None:
     """Other memories give other losses; what stands where the mask is False gives none."""
-    other = _loss(policy, batch, draws, replace(found, tokens=-found.tokens))
+    other = _loss(policy, batch, draws, replace(memory, tokens=-memory.tokens))
     assert (other - before).abs().min() > 0, "memory does not reach the action: other tokens, the same loss."
-    padded = replace(found, tokens=found.tokens.masked_fill(~found.mask[..., None], 1e3))
-    assert (~found.mask).any(), "the check needs padding among the memory tokens"
+    padded = replace(memory, tokens=memory.tokens.masked_fill(~memory.mask[..., None], 1e3))
+    assert (~memory.mask).any(), "the check needs padding among the memory tokens"
     error = float((_loss(policy, batch, draws, padded) - before).abs().max())
-    assert error <= TOLERANCE, f"what stands in the memory's padding changed the loss by {error:.2g}."
+    assert error <= TOLERANCE, f"what is in the memory's padding changed the loss by {error:.2g}."
 
 
-def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], found: MemoryTokens, before: Tensor) -> None:
+def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor) -> None:
     """Samples do not see each other."""
-    together, _ = policy(batch, draws, memory=found)
+    together, _ = policy(batch, draws, memory=memory)
     error = float((together - before.mean()).abs())
     assert error <= TOLERANCE, f"samples of one batch see each other: alone their loss differs by {error:.2g}."
 
 
-def check_sampling(policy: MMEPolicy, batch: Batch, found: MemoryTokens) -> None:
+def check_sampling(policy: MMEPolicy, batch: Batch, memory: MemoryTokens) -> None:
     """What runs once a chunk and what runs in every step add up to the pass that training makes."""
-    draws = {k: torch.stack([v, v]) for k, v in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    draws = {k: torch.stack([v, v]) for k, v in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
     for steps in (1, 2):  # as many as samples, too: a step must not be taken for a sample
-        chunk = policy.sample_actions(batch, draws, steps=steps, memory=found)
+        chunk = policy.sample_actions(batch, draws, steps=steps, memory=memory)
         assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
         if "noise" in draws:  # Euler's way from noise at time 1, each velocity in one joint pass
             joint = draws["noise"]
             for time in (1 - i / steps for i in range(steps)):
-                joint = joint - policy.velocity(batch, joint, torch.full((2,), time), found) / steps
+                joint = joint - policy.velocity(batch, joint, torch.full((2,), time), memory) / steps
             error = float((chunk - joint).abs().max())
             assert error <= TOLERANCE, f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
 
@@ -110,6 +112,6 @@ def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -
     loss.backward()
     idle = [
         name for name, parameter in policy.named_parameters()
-        if policy.part_of(name) == "memory" and (parameter.grad is None or not parameter.grad.any())
+        if policy.finetune_spec.component_of(name) == "memory" and (parameter.grad is None or not parameter.grad.any())
     ]  # fmt: skip
     assert not idle, f"no gradient reaches {', '.join(idle)}."

@@ -1,4 +1,4 @@
-"""`check_memory`: does a memory keep the promises that training, streaming and the integrations rely on?"""
+"""`check_memory`: the properties of a memory that training, streaming and the integrations rely on."""
 
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import mme_vla.memory  # noqa: F401  (registers what ships)
-from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.base import Memory, encode_histories, make_scorer, stack_history, start_stream, uses_proprio
 from mme_vla.memory.history import CachedHistory, FrameScores, History, OnlineHistory
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
@@ -22,14 +22,14 @@ _Kind = TypeVar("_Kind", bound=History)
 def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     """Run every check on the memory that is registered under `name`, and print a line for each that passed.
 
-    The episode is synthetic: `frames` pictures in which a square moves, the first 20 of them a conditioning video.
+    The episode is synthetic: `frames` images in which a square moves, the first 20 of them a conditioning video.
 
     Args:
         name: the key in `MEMORIES`. frames: length of the episode, at least 40.
         options: the memory's own, as its YAML would give them.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown memory or option.
     """
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
@@ -51,7 +51,7 @@ class Episode:
 
     def __init__(self, memory: Memory, frames: int, seed: int = 0) -> None:
         self.memory, self.length = memory, frames
-        self.pictures = moving_frames(frames, seed=seed)
+        self.images = moving_frames(frames, seed=seed)
         generator = torch.Generator().manual_seed(seed)
         self.tokens = torch.randn(frames, memory.storage.grid**2, D_VISION, generator=generator)
         self.motion = torch.randn(frames, MOTION, generator=generator)
@@ -59,74 +59,78 @@ class Episode:
     def cached(self, length: int | None = None) -> CachedHistory:
         """The whole episode, or its first `length` frames, as read from a cache."""
         length = self.length if length is None else length
-        spec, scorer = self.memory.storage, self.memory.make_scorer()
-        kept = spec.kept_frames(length)
-        rows = [] if scorer is None else [(t, scorer(t, self.pictures[t])) for t in range(length)]
+        spec, scorer = self.memory.storage, make_scorer(self.memory)
+        stored = spec.stored_frames(length)
+        rows = [] if scorer is None else [(t, scorer(t, self.images[t])) for t in range(length)]
         scored = [(t, values) for t, values in rows if values is not None]
         scores = FrameScores(np.array([t for t, _ in scored]), np.stack([v for _, v in scored])) if scored else None
-        history = CachedHistory(spec, self.tokens[kept].numpy(), kept, length, scores, self.exec_start)
+        history = CachedHistory(spec, self.tokens[stored].numpy(), stored, length, scores, self.exec_start)
         return self._moving(history)
 
     def _moving(self, history: _Kind) -> _Kind:
         """The history with what the robot felt and did, where its memory reads that."""
-        history.motion, history.state_width = self.motion.__getitem__ if self.memory.reads_motion else None, STATE
+        history.motion, history.state_width = self.motion.__getitem__ if uses_proprio(self.memory) else None, STATE
         return history
 
     def online(self, piece: int, until: int | None = None) -> OnlineHistory:
         """The first `until` frames as an environment delivers them, `piece` at a time."""
-        history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
+        history = self._moving(OnlineHistory(self.memory.storage, make_scorer(self.memory), self.exec_start))
         self.extend(history, piece, self.length if until is None else until)
         return history
 
-    def sparse(self, drawn: np.ndarray, until: int) -> OnlineHistory:
-        """The first `until` frames, of which only some have a picture."""
-        history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
-        tokens = self.tokens[history.wanted(until, drawn)]
-        history.append(self.pictures[drawn], tokens, drawn, until)
+    def sparse(self, rendered: np.ndarray, until: int) -> OnlineHistory:
+        """The first `until` frames, of which only some have an image."""
+        history = self._moving(OnlineHistory(self.memory.storage, make_scorer(self.memory), self.exec_start))
+        tokens = self.tokens[history.to_encode(until, rendered)]
+        history.append(self.images[rendered], tokens, rendered, until)
         return history
 
     def extend(self, history: OnlineHistory, piece: int, until: int) -> None:
         """Deliver the frames that a history lacks, up to `until`."""
         for start in range(len(history), until, piece):
             stop = min(start + piece, until)
-            wanted = history.wanted(stop - start)
-            history.append(self.pictures[start:stop], self.tokens[start:stop][wanted])
+            required = history.to_encode(stop - start)
+            history.append(self.images[start:stop], self.tokens[start:stop][required])
 
 
 def check_selection(memory: Memory, frames: int) -> None:
     """`select`: in bounds, in time order, blind to the future, repeatable, the same offline and online."""
     episode, patches = Episode(memory, frames), memory.storage.grid**2
-    whole = episode.cached()
+    full = episode.cached()
     for step in (0, 1, 15, 16, 17, 39, frames - 1):
-        chosen = memory.select(whole, step)
-        assert chosen.ndim == 2 and chosen.shape[1] == 2 and np.issubdtype(chosen.dtype, np.integer), (
-            f"select must return whole numbers [n, 2] of (frame, patch); at step {step} it gave {chosen.dtype} "
-            f"{chosen.shape}."
+        selection = memory.select(full, step)
+        assert selection.ndim == 2 and selection.shape[1] == 2 and np.issubdtype(selection.dtype, np.integer), (
+            f"select must return whole numbers [n, 2] of (frame, patch); at step {step} it gave {selection.dtype} "
+            f"{selection.shape}."
         )
-        assert len(chosen) <= memory.capacity, f"select chose {len(chosen)} tokens; capacity is {memory.capacity}."
-        assert len(chosen) > 0, f"select chose nothing at step {step}: the current frame at least is always there."
-        assert chosen[:, 0].max() <= step, f"at step {step} select chose frame {chosen[:, 0].max()}, which is later."
-        assert chosen.min() >= 0 and chosen[:, 1].max() < patches, f"patches must lie in 0 to {patches - 1}."
-        assert (np.diff(chosen[:, 0]) >= 0).all(), f"at step {step} the selection is not in time order."
-        kept = set(memory.storage.kept_frames(step + 1).tolist())
-        pictures = set() if memory.reads_motion else set(chosen[:, 0].tolist())
-        assert pictures <= kept, "select chose frames that the StorageSpec does not keep."
-        again = memory.select(whole, step)
-        assert np.array_equal(chosen, again), "without rng, select must make the same choice every time."
+        assert len(selection) <= memory.capacity, (
+            f"select chose {len(selection)} tokens; capacity is {memory.capacity}."
+        )
+        assert len(selection) > 0, f"select chose nothing at step {step}: the current frame at least is always there."
+        assert selection[:, 0].max() <= step, (
+            f"at step {step} select chose frame {selection[:, 0].max()}, which is later."
+        )
+        assert selection.min() >= 0 and selection[:, 1].max() < patches, f"patches must lie in 0 to {patches - 1}."
+        assert (np.diff(selection[:, 0]) >= 0).all(), f"at step {step} the selection is not in time order."
+        stored = set(memory.storage.stored_frames(step + 1).tolist())
+        selected_frames = set() if uses_proprio(memory) else set(selection[:, 0].tolist())
+        assert selected_frames <= stored, "select chose frames that the StorageSpec does not keep."
+        again = memory.select(full, step)
+        assert np.array_equal(selection, again), "without rng, select must make the same choice every time."
         short = memory.select(episode.cached(step + 1), step)
-        assert np.array_equal(chosen, short), f"what comes after step {step} changed what select chose there."
+        assert np.array_equal(selection, short), f"what comes after step {step} changed what select chose there."
         read = memory.frames_read([step], episode.exec_start)
-        assert pictures <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
+        assert selected_frames <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
         sparse = memory.select(episode.sparse(read, step + 1), step)
-        assert np.array_equal(chosen, sparse), f"at step {step} select differs where only frames_read was drawn."
+        assert np.array_equal(selection, sparse), f"at step {step} select differs where only frames_read was rendered."
     for piece in (1, 16, 23):
         history = episode.online(piece)
-        offline = memory.select(whole, frames - 1)
+        offline = memory.select(full, frames - 1)
         assert np.array_equal(memory.select(history, frames - 1), offline), (
             f"with frames arriving {piece} at a time select chose otherwise than offline."
         )
     rng = np.random.default_rng(0)
-    assert len(memory.select(whole, frames - 1, rng)) <= memory.capacity, "with rng, select chose too many tokens."
+    assert len(memory.select(full, frames - 1, rng)) <= memory.capacity, "with rng, select chose too many tokens."
 
 
 @torch.no_grad()
@@ -135,7 +139,7 @@ def _encoded(memory: Memory, history: HistoryTokens) -> MemoryTokens:
 
 
 def _recalled(memory: Memory, history: History, *steps: int) -> HistoryTokens:
-    return stack_history([memory.recall(history, step) for step in steps])
+    return stack_history([memory.gather_selection(history, step) for step in steps])
 
 
 def _valid(tokens: MemoryTokens) -> Tensor:
@@ -144,26 +148,26 @@ def _valid(tokens: MemoryTokens) -> Tensor:
 
 def check_encoding(memory: Memory, frames: int) -> None:
     """`forward`: within budget, finite, blind to padding and to its batch, with gradients to all it learns."""
-    whole = Episode(memory, frames).cached()
-    history = _recalled(memory, whole, 2, frames - 1)  # the first with padding, where there is room
-    found = _encoded(memory, history)
+    full = Episode(memory, frames).cached()
+    history = _recalled(memory, full, 2, frames - 1)  # the first with padding, if it is shorter
+    encoded = _encoded(memory, history)
     shape = (2, memory.budget, WIDTH)
-    assert found.tokens.shape == shape, f"forward must return tokens {shape}; got {tuple(found.tokens.shape)}."
-    assert found.mask.shape == shape[:2] and found.mask.dtype == torch.bool, "the mask must be bool [b, budget]."
-    assert found.mask.any(1).all(), "a row has no valid memory token."
-    assert torch.isfinite(_valid(found)).all(), "a valid memory token is not finite."
+    assert encoded.tokens.shape == shape, f"forward must return tokens {shape}; got {tuple(encoded.tokens.shape)}."
+    assert encoded.mask.shape == shape[:2] and encoded.mask.dtype == torch.bool, "the mask must be bool [b, budget]."
+    assert encoded.mask.any(1).all(), "a row has no valid memory token."
+    assert torch.isfinite(_valid(encoded)).all(), "a valid memory token is not finite."
 
     hidden = replace(history, features=history.features.clone(), positions=history.positions.clone())
     hidden.features[~history.mask], hidden.positions[~history.mask] = 1e3, 77.0
-    error = float((_valid(_encoded(memory, hidden)) - _valid(found)).abs().max())
-    assert error <= TOLERANCE, f"what stands in padding changed the memory tokens by {error:.2g}."
+    error = float((_valid(_encoded(memory, hidden)) - _valid(encoded)).abs().max())
+    assert error <= TOLERANCE, f"what is in padding changed the memory tokens by {error:.2g}."
 
     alone = _encoded(memory, history.rows(slice(1, None)))
-    error = float((_valid(alone)[0] - _valid(found)[1]).abs().max())
+    error = float((_valid(alone)[0] - _valid(encoded)[1]).abs().max())
     assert error <= TOLERANCE, f"beside another sample the same selection gives other tokens (by {error:.2g})."
 
     changed = replace(history, features=-history.features)
-    assert not torch.equal(_valid(_encoded(memory, changed)), _valid(found)), "forward does not read the features."
+    assert not torch.equal(_valid(_encoded(memory, changed)), _valid(encoded)), "forward does not read the features."
 
     was = {name: parameter.requires_grad for name, parameter in memory.named_parameters()}
     memory.requires_grad_(True)
@@ -178,15 +182,17 @@ def check_encoding(memory: Memory, frames: int) -> None:
 
 @torch.no_grad()
 def check_streaming(memory: Memory, frames: int) -> None:
-    """`remember`: an episode that grows gives the tokens that a fresh look at the whole of it gives."""
+    """`remember`: an episode that grows gives the tokens of the complete one."""
     first, second = Episode(memory, frames, seed=1), Episode(memory, frames, seed=2)
     histories = [first.online(16, 16), second.online(16, 16)]
-    streams = [memory.start_stream() for _ in histories]
+    streams = [start_stream(memory) for _ in histories]
     for until in (16, 32, 37, frames):
         for episode, history in zip((first, second), histories, strict=True):
             episode.extend(history, 16, until)
-        streamed = memory.encode(histories, streams)
-        fresh = _encoded(memory, stack_history([memory.recall(history, len(history) - 1) for history in histories]))
+        streamed = encode_histories(memory, histories, streams)
+        fresh = _encoded(
+            memory, stack_history([memory.gather_selection(history, len(history) - 1) for history in histories])
+        )
         error = float((_valid(streamed) - _valid(fresh)).abs().max())
         assert error <= TOLERANCE, f"after {until} frames the stream's tokens differ from a fresh look by {error:.2g}."
 

@@ -14,7 +14,7 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
         task: the key in `TASKS`. seed, difficulty: of the scene. options: the task's own keywords.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown task or option, or the simulator is not installed.
     """
     first, second = (_demonstrated(task, seed, difficulty, options) for _ in range(2))
@@ -49,7 +49,7 @@ def _scene(task: str, seed: int, difficulty: str | None, options: dict[str, Any]
 
 
 def _demonstrated(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> dict[str, Any]:
-    from mme_vla.envs.recording.demonstration import demonstrate
+    from mme_vla.envs.recording.recorder import demonstrate
     from mme_vla.envs.robot.demonstrator import Demonstrator
 
     env = _make(task, seed, difficulty, options)
@@ -57,7 +57,7 @@ def _demonstrated(task: str, seed: int, difficulty: str | None, options: dict[st
         env.reset()
         track: list[np.ndarray] = []
         script = env.unwrapped
-        script.observe = lambda info: track.append(script.qpos)
+        script.on_frame = lambda info: track.append(script.qpos)
         done = demonstrate(script, Demonstrator(script, env.step))
         return {
             "goal": script.goals(), "subtasks": len(script.progress.subtasks), "success": bool(done),

@@ -9,11 +9,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.memory.base import make_scorer, past_view_spec
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
-from mme_vla.processing.normalisers import NormStats, QuantileStats
-from mme_vla.processing.past_views import full_past
+from mme_vla.processing.images import full_past
+from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.types import Batch, HistoryTokens, PastViews
 
 PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
@@ -55,9 +56,9 @@ def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
 
 def tiny_sections(model: str, backbone: str = "tiny") -> dict[str, Any]:
     """The plain sections of a model at a small backbone's size, for `MMEPolicy.from_config`."""
-    plain = OmegaConf.to_container(_composed(*policy_words(model, {"backbone": backbone})), resolve=True)
-    assert isinstance(plain, dict)
-    return {str(key): plain[key] for key in ("backbone", "memory", "integration", "policy")}
+    sections = OmegaConf.to_container(_composed(*policy_words(model, {"backbone": backbone})), resolve=True)
+    assert isinstance(sections, dict)
+    return {str(key): sections[key] for key in ("backbone", "memory", "integration", "policy")}
 
 
 @cache
@@ -93,7 +94,7 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
 
 
 def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:
-    """A batch of noise pictures, short prompts and random actions."""
+    """A batch of noise images, short prompts and random actions."""
     generator = torch.Generator().manual_seed(seed)
     size, length, views = policy.backbone.image_size, 16, len(policy.embodiment.cameras)
     prompt_mask = torch.zeros(batch, length, dtype=torch.bool)
@@ -114,7 +115,7 @@ def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | Non
     if policy.memory is None:
         return None
     views = len(policy.embodiment.cameras)
-    past = full_past(policy.memory.looks_back, views, policy.backbone.image_size, "cpu")
+    past = full_past(past_view_spec(policy.memory), views, policy.backbone.image_size, "cpu")
     if past is None:
         return None
     generator = torch.Generator().manual_seed(seed + 1)
@@ -138,9 +139,9 @@ def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
 def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -> CachedHistory:
     """What a cache of this whole episode would hold, encoded in one go."""
     memory = policy.require_memory()
-    spec, scorer = memory.storage, memory.make_scorer()
-    kept = spec.kept_frames(len(frames))
-    tokens = policy.encode_frames(frames[kept])
+    spec, scorer = memory.storage, make_scorer(memory)
+    stored_frames = spec.stored_frames(len(frames))
+    tokens = policy.encode_frames(frames[stored_frames])
     rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
     scored = [(t, values) for t, values in rows if values is not None]
     scores = (
@@ -149,14 +150,14 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
         else None
     )
     stored = tokens.view(torch.uint16).numpy() if tokens.dtype == torch.bfloat16 else tokens.numpy()
-    return CachedHistory(spec, stored, kept, len(frames), scores, exec_start)
+    return CachedHistory(spec, stored, stored_frames, len(frames), scores, exec_start)
 
 
 def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
     """The same episode as an environment would deliver it, `chunk` frames at a time."""
     memory = policy.require_memory()
-    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
+    history = OnlineHistory(memory.storage, make_scorer(memory), exec_start)
     for start in range(0, len(frames), chunk):
         part = frames[start : start + chunk]
-        history.append(part, policy.encode_frames(part[history.wanted(len(part))]))
+        history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))
     return history

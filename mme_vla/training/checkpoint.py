@@ -8,7 +8,7 @@
         SHA256SUMS               of each of these files (the last pass of writing reads them once more)
 
 All randomness is a function of (seed, step), so there is no generator state and no data position to keep. Nothing is
-pickled: a checkpoint from a stranger cannot run code.
+pickled: a checkpoint from an untrusted source cannot run code.
 """
 
 import importlib.metadata
@@ -23,21 +23,21 @@ import torch
 from torch import Tensor, distributed, nn
 
 from mme_vla.errors import UserError, listed
-from mme_vla.files import check_sums, inside, read_json, write_sums
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
+from mme_vla.policy.saving import save_settings
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     cast,
     check_values,
+    list_weight_files,
     load_tensors,
     read_files,
     replace_folder,
     save_tensors,
-    written_weights,
 )
-from mme_vla.training.ema import EMA
-from mme_vla.training.parallel import like, whole_state
+from mme_vla.training.optim import EMA
+from mme_vla.training.parallel import full_state, like
 from mme_vla.training.settings import KeepRule
 from mme_vla.training.shards import (
     MOMENTS,
@@ -48,6 +48,7 @@ from mme_vla.training.shards import (
     shard_files,
     training_tensors,
 )
+from mme_vla.utils import check_sums, inside, read_json, write_sums
 
 FORMAT = "mme_vla training checkpoint 1"
 RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"
@@ -102,7 +103,7 @@ def save_shards(
     keep: KeepRule,
     hurry: bool = False,
 ) -> Path:
-    """Begin to write `folder`/step_… of a sharded run; all processes call it, and go on when `writer` has its copies.
+    """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the copies alone.
 
     Args:
         hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's weights into it
@@ -112,11 +113,11 @@ def save_shards(
     first = distributed.get_rank() == 0
     writer.wait()  # the checkpoint before
     with ema.applied():
-        averaged = whole_state(policy)
+        averaged = full_state(policy)
     about: list[str] = []
     if first:
         fresh_folder(draft)
-        about = [*policy.save_about(draft), STATE]
+        about = [*save_settings(policy, draft), STATE]
 
     def finish() -> None:
         place = draft
@@ -125,7 +126,7 @@ def save_shards(
             write_sums(draft, about)
             place = _publish(draft, target)
         save_tensors(averaged, place, dtype=torch.float32)
-        write_sums(place, [*about, *written_weights(place)])
+        write_sums(place, [*about, *list_weight_files(place)])
         if not hurry:
             _publish(draft, target)
         tidy(folder, keep)
@@ -135,22 +136,18 @@ def save_shards(
 
 
 def load_policy(checkpoint: Path, policy: Policy) -> None:
-    """Give a policy, on meta or not, the weights that a run goes on from; `restore` brings all else."""
-    whole = read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
-    assign_tensors(policy, whole, str(checkpoint))
+    """Give a policy, on meta or not, the weights that a run continues from; `restore` brings all else."""
+    tensors = read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
+    assign_tensors(policy, tensors, str(checkpoint))
 
 
 def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optimizer) -> None:
-    """Put everything back as it was when `folder` was written.
-
-    Raises:
-        UserError: a damaged file, or tensors that do not fit this policy.
-    """
+    """Put everything back as it was when `folder` was written."""
     parameters = trainable(policy)
     if shard_files(folder):
         moments = read_shards(folder, policy, ema.tensors(), optimizer, parameters)
     else:
-        moments = _read_whole(folder, policy, ema)
+        moments = _read_full(folder, policy, ema)
     state = optimizer.state_dict()
     place = {id(p): i for i, p in enumerate(p for group in optimizer.param_groups for p in group["params"])}
     state["state"] = {
@@ -162,30 +159,26 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
     optimizer.load_state_dict(state)
 
 
-def _read_whole(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
+def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
     """Give weights and averages back their values, and return Adam's moments and counts as `<name>/<key>`."""
     parameters = trainable(policy)
     averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
-    own = policy.state_dict()
-    low = {name for name, tensor in own.items() if tensor.dtype == torch.bfloat16}  # frozen, and stored in float32
+    state = policy.state_dict()
+    low = {name for name, tensor in state.items() if tensor.dtype == torch.bfloat16}  # frozen, and stored in float32
     averaged = {name: cast(tensor, torch.bfloat16) if name in low else tensor for name, tensor in averaged.items()}
-    _check_fit(folder / "model.safetensors", averaged, own)
+    _check_fit(folder / "model.safetensors", averaged, state)
     _check_fit(folder / RAW, raw, parameters)
-    wanted = {f"{name}/{key}": p for name, p in parameters.items() for key in _ADAM if f"{name}/{key}" in moments}
-    _check_fit(folder / OPTIMIZER, moments, wanted, scalar="/step")
+    required = {f"{name}/{key}": p for name, p in parameters.items() for key in _ADAM if f"{name}/{key}" in moments}
+    _check_fit(folder / OPTIMIZER, moments, required, scalar="/step")
     for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
         check_values(tensors, str(path))
     ema.load(averaged)
-    policy.load_state_dict({name: like(own[name], tensor) for name, tensor in {**averaged, **raw}.items()})
+    policy.load_state_dict({name: like(state[name], tensor) for name, tensor in {**averaged, **raw}.items()})
     return moments
 
 
 def read_state(checkpoint: Path) -> dict[str, Any]:
-    """What `training_state.json` says.
-
-    Raises:
-        UserError: the folder holds weights only, or the file is damaged or of another program.
-    """
+    """What `training_state.json` says."""
     path = checkpoint / STATE
     if not path.is_file():
         raise UserError(
@@ -216,9 +209,6 @@ def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = Fal
     """Refuse to begin a run whose first checkpoints would not fit on the disk.
 
     A sharded run's hold the weights twice: the trained ones in parts, and the averages whole.
-
-    Raises:
-        UserError: saying how much is needed and free.
     """
     weights = sum(p.numel() * p.element_size() for p in policy.parameters())
     trained = sum(p.numel() * p.element_size() for p in trainable(policy).values())
@@ -269,14 +259,14 @@ def _read(path: Path) -> dict[str, Tensor]:
         raise UserError(f"{error} Resume from an older checkpoint.") from None
 
 
-def _check_fit(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = "") -> None:
+def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = "") -> None:
     """Refuse tensors that are missing, left over, misshapen or of another dtype."""
-    names = set(found) ^ set(expected)
+    names = set(tensors) ^ set(expected)
     wrong = sorted(names) + [
-        f"{name}: {tuple(found[name].shape)} {found[name].dtype}"
-        for name in sorted(set(found) & set(expected))
+        f"{name}: {tuple(tensors[name].shape)} {tensors[name].dtype}"
+        for name in sorted(set(tensors) & set(expected))
         if not (scalar and name.endswith(scalar))
-        and (found[name].shape, found[name].dtype) != (expected[name].shape, expected[name].dtype)
+        and (tensors[name].shape, tensors[name].dtype) != (expected[name].shape, expected[name].dtype)
     ]
     if wrong:
         raise UserError(

@@ -5,20 +5,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.cache.ensure import ensure_cache
-from mme_vla.data.cache.store import COMMAND
-from mme_vla.data.dataset import TrainingDataset
-from mme_vla.data.groups import GroupDataset
-from mme_vla.data.keyframe_dataset import KeyframeDataset
-from mme_vla.data.sources import open_sources
-from mme_vla.data.splits import default_val_episodes, split_episodes
+from mme_vla.data.cache import COMMAND
+from mme_vla.data.cache_building import ensure_cache
+from mme_vla.data.dataset import GroupDataset, TrainingDataset
+from mme_vla.data.keyframes import KeyframeDataset
+from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
-from mme_vla.files import check_sums, inside
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import TrainsOnKeyframes, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
-from mme_vla.processing.normalisers import NormStats
-from mme_vla.processing.subgoal_text import SubgoalText
+from mme_vla.processing.normalise import NormStats
+from mme_vla.processing.prompt import SubgoalText
+from mme_vla.utils import check_sums, inside
 
 
 @dataclass(frozen=True)
@@ -48,9 +47,6 @@ def prepare_data(
         stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
         say: takes a line for the user.
         encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by default asked here.
-
-    Raises:
-        UserError: whatever is wrong with the data, before any training.
     """
     sources = open_sources(data["sources"], policy.embodiment)
     val_episodes = default_val_episodes(sources) if data["val_episodes"] is None else data["val_episodes"]
@@ -60,24 +56,25 @@ def prepare_data(
         check_sums(stats_from, [STATS_FILE])
         processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
-        counted = processor.counted
+        counted, horizon = processor.stats_spec, processor.embodiment.action.horizon
         processor.stats = compute_norm_stats(
-            sources, split.train, counted.horizon or processor.horizon, offset, seed, policy.embodiment,
+            sources, split.train, counted.horizon or horizon, offset, seed, policy.embodiment,
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video,
         )  # fmt: skip
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
-        cache, encoder = data["cache"], encoder or policy.vision_fingerprint()
+        cache, source_policy = data["cache"], with_vision_memory(policy)
+        encoder = encoder or source_policy.vision_fingerprint()
         caches = [
             ensure_cache(
                 source,
                 policy.memory,
-                policy.encode_frames,
+                source_policy.encode_frames,
                 encoder,
                 root=cache["root"],
-                dtype=str(policy.history_dtype).removeprefix("torch."),
+                dtype=str(source_policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
                 command=cache_command,
@@ -86,11 +83,10 @@ def prepare_data(
         ]
 
     def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
-        if processor.samples == "keyframes":
-            return KeyframeDataset(
-                sources, processor, policy.keyframes, episodes=episodes, seed=seed, drawn=not held_out
-            )
-        kind = GroupDataset if processor.group_size > 1 else TrainingDataset
+        if processor.samples.kind == "keyframes":
+            keyframes = policy.keyframes if isinstance(policy, TrainsOnKeyframes) else 1
+            return KeyframeDataset(sources, processor, keyframes, episodes=episodes, seed=seed, sampled=not held_out)
+        kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
         return kind(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
             mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal, seed=seed,
@@ -107,11 +103,7 @@ def prepare_data(
 
 
 def check_frozen(policy: Policy, freeze_vision: bool) -> None:
-    """Refuse to train the vision tower under a memory, whose cached tokens would not follow it.
-
-    Raises:
-        UserError: that combination.
-    """
+    """Refuse to train the vision tower under a memory, whose cached tokens would not follow it."""
     if policy.memory is not None and not freeze_vision:
         raise UserError(
             "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "

@@ -1,6 +1,7 @@
 """The training loop: update, average, log, validate, save."""
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -11,8 +12,12 @@ from accelerate import Accelerator
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from mme_vla.data.dataset import TrainingDataset
+from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import AugmentsImages
+from mme_vla.speed import Recomputes
 from mme_vla.training.checkpoint import (
     checkpoint_name,
     restore,
@@ -21,20 +26,18 @@ from mme_vla.training.checkpoint import (
     tidy,
     trainable,
 )
-from mme_vla.training.console import ProgressLine, memory_gib
-from mme_vla.training.ema import EMA
-from mme_vla.training.logging import Loggers
-from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
-from mme_vla.training.order import BatchOrder, generator_for, seed_of
-from mme_vla.training.parallel import reshard, shard, whole_number
-from mme_vla.training.reading_ahead import readers, size_of
-from mme_vla.training.runs import Run
+from mme_vla.training.data import SplitData
+from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
+from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
+from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
+from mme_vla.training.order import BatchOrder, Collate, Samples, Validation, generator_for, readers, seed_of, size_of
+from mme_vla.training.parallel import full_value, gathered, reshard, shard
+from mme_vla.training.runs import PLOT, SUMMARY, Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
-from mme_vla.training.stopping import leave_signals_alone, stop_asked
-from mme_vla.training.validation import Collate, Samples, Validation
-from mme_vla.training.window import Window
+from mme_vla.training.stopping import leave_signals_alone, stop_requests
 from mme_vla.types import send
+from mme_vla.utils import write_atomically
 
 
 class _InEpoch(Dataset[Any]):
@@ -70,9 +73,6 @@ class Trainer:
             policy: with the parameters frozen that shall not learn. samples: the training split.
             validation: held-out samples, if any.
             config: the plain configuration, saved with every checkpoint.
-
-        Raises:
-            UserError: too few samples for the batch, or a checkpoint that does not fit.
         """
         self.settings, self.run_info, self.config = settings, run, config
         self.accelerator, self.validation = accelerator, validation
@@ -99,7 +99,13 @@ class Trainer:
         if not self.sharded:
             policy.to(accelerator.device)
         self.policy = policy.train()
-        policy.recompute(settings.recomputation)
+        if settings.recomputation:
+            if not isinstance(policy, Recomputes):
+                raise UserError(
+                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute activations; set it "
+                    "to false."
+                )
+            policy.recompute(settings.recomputation)
         if settings.compile:
             policy.compile()
         if self.sharded:
@@ -138,13 +144,13 @@ class Trainer:
                 tidy(self.run_info.checkpoints, settings.keep)
             return True
         batches = iter(self.loader)
-        with stop_asked() as asked:
+        with stop_requests() as stop:
             for step in range(self.run_info.step, settings.steps):
                 done = step + 1
                 with _reporting(self.policy.memory, self._due(done)):
                     window.add(self.update(step, batches, window))
                 line.advance()
-                stopping = asked() and done < settings.steps
+                stopping = stop() and done < settings.steps
                 saving = stopping or done == settings.steps or done % settings.save_every == 0
                 # A window ends with every checkpoint, so that a resumed run has the same windows.
                 if saving or self._due(done):
@@ -155,8 +161,8 @@ class Trainer:
                     if saving:
                         self.save(done, stopping)
                 if stopping:
-                    self.stopped_by = asked.signal
-                    line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
+                    self.stopped_by = stop.signal
+                    line.say(f"Stopped at step {done} as asked; continue with resume={self.run_info.folder}")
                     return False
         return True
 
@@ -166,10 +172,11 @@ class Trainer:
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
-        # Of the whole update: the pictures of a sample depend neither on the number of processes nor of pieces.
-        pictures = generator_for(settings.seed, "model", step, 0, 0)
-        draws = {**draws, **self.policy.picture_draws(settings.batch_size, pictures)}
+        draws = self.policy.training_noise(settings.batch_size, generator_for(settings.seed, "train", step))
+        # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
+        generator = generator_for(settings.seed, "model", step, 0, 0)
+        if isinstance(self.policy, AugmentsImages):
+            draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():
@@ -185,7 +192,7 @@ class Trainer:
                 part = value.detach().float() / settings.accumulate
                 sums[name] = sums[name] + part if name in sums else part
         gradients = [p.grad for p in self._parameters if p.grad is not None]
-        norm = whole_number(clip_gradients(gradients, settings.clip_norm))
+        norm = full_value(clip_gradients(gradients, settings.clip_norm))
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.ema.update(step)
@@ -220,12 +227,12 @@ class Trainer:
             stopping: the process may be killed before long: what resuming needs comes first.
         """
         folder, keep = self.run_info.checkpoints, self.settings.keep
-        held = (self.policy, self.ema, self.optimizer, self.config, keep)
+        saved = (self.policy, self.ema, self.optimizer, self.config, keep)
         if self._shard_writer is not None:
-            save_shards(self._shard_writer, folder, step, *held, hurry=stopping)
+            save_shards(self._shard_writer, folder, step, *saved, hurry=stopping)
         else:
             if self.accelerator.is_main_process:
-                save_checkpoint(folder, step, *held)
+                save_checkpoint(folder, step, *saved)
             self.accelerator.wait_for_everyone()
         self.last_checkpoint = folder / checkpoint_name(step)
         return self.last_checkpoint
@@ -249,9 +256,9 @@ class Trainer:
 
 
 @contextmanager
-def _reporting(memory: Memory | None, wanted: bool) -> Iterator[None]:
+def _reporting(memory: Memory | None, enabled: bool) -> Iterator[None]:
     """Let the memory report numbers about its inside while this is open."""
-    if memory is None or not wanted:
+    if memory is None or not enabled:
         yield
         return
     memory.reporting = True
@@ -259,3 +266,83 @@ def _reporting(memory: Memory | None, wanted: bool) -> Iterator[None]:
         yield
     finally:
         memory.reporting = False
+
+
+def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine, loggers: Loggers) -> dict[str, Any]:
+    """Check the averaged weights open loop, and write `open_loop.png` and `summary.json` into the run folder.
+
+    All processes call it, so that shared weights come together; the first does all else.
+
+    Args:
+        seconds: what the run took so far, for the summary.
+    """
+    folder, settings, policy = trainer.run_info.folder, trainer.settings, trainer.policy
+    samples = data.train if data.val is None else data.val
+    first, result = trainer.accelerator.is_main_process, None
+    if settings.open_loop_chunks and not isinstance(samples, TrainingDataset):
+        line.say("no open-loop check: it compares chunks step by step, and these samples are keyframes")
+    elif isinstance(samples, TrainingDataset) and settings.open_loop_chunks and (first or trainer.sharded):
+        with trainer.ema.applied(), gathered(policy):
+            if first:
+                policy.eval()
+                result = open_loop(policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None)
+    if not first:
+        return {}
+    summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
+    if result is not None:
+        plot_open_loop(result, folder / PLOT, trainer.config["name"])
+        loggers.log_image(settings.steps, "open_loop", folder / PLOT)
+        summary["open_loop"] = result.summary()
+        line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))
+        if verdict := worse_than_still(summary["open_loop"], settings.steps):
+            line.say(verdict)
+        line.say(f"plot: {folder / PLOT}")
+    summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
+    with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
+        draft.write_text(json.dumps(summary, indent=2) + "\n")
+    line.say(f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth of the run)")
+    line.say(f"checkpoint: {trainer.last_checkpoint}")
+    return summary
+
+
+def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
+    """A sentence on the numbers that holding still would predict better; empty where there are none.
+
+    Args:
+        summary: of the open-loop check; without `mean_abs_error_holding_still` where the state is no action.
+        steps: updates of the run.
+    """
+    if "mean_abs_error_holding_still" not in summary:
+        return ""
+    pairs = zip(summary["mean_abs_error"], summary["mean_abs_error_holding_still"], strict=True)
+    worse = sum(error > still for error, still in pairs)
+    if not worse:
+        return ""
+    return (
+        f"{worse} of {len(summary['names'])} numbers of the action are predicted worse than by holding still (the "
+        f"robot moves little within a chunk): {steps:,} updates on this data are too few for a policy. They show that "
+        "everything runs; raise train.steps, or train on more data, before evaluating."
+    )
+
+
+def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict[str, float]:
+    """The mean training loss over the first and over the last `share` of a run, and the last validation loss.
+
+    Args:
+        lines: of `metrics.jsonl`; each holds the mean since the line before it.
+    """
+    losses = [(line["step"], line["train/loss"]) for line in lines if "train/loss" in line]
+    if not losses:
+        return {}
+    total = losses[-1][0]
+    before = [0, *(step for step, _ in losses[:-1])]
+    spans = [(begun, step, loss) for begun, (step, loss) in zip(before, losses, strict=True)]
+
+    def mean(entries: list[tuple[int, int, float]]) -> float:
+        return sum((end - begun) * loss for begun, end, loss in entries) / sum(end - begun for begun, end, _ in entries)
+
+    first = [span for span in spans if span[0] < max(share * total, 1)]
+    last = [span for span in spans if span[1] > min((1 - share) * total, total - 1)]
+    change = {"first_loss": mean(first), "last_loss": mean(last)}
+    held_out = [line["val/loss"] for line in lines if "val/loss" in line]
+    return {**change, "val_loss": held_out[-1]} if held_out else change

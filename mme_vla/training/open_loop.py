@@ -1,4 +1,4 @@
-"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as a picture."""
+"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as an image."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mme_vla.backbone.base import stack_draws
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.embodiment import ActionSpace, Embodiment
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
+from mme_vla.types import stack_noise
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class OpenLoop:
         physical = self.error()
         still = {}
         if self.still is not None:
-            held = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
-            still = {"mean_abs_error_holding_still": held.round(5).tolist()}
+            still_error = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
+            still = {"mean_abs_error_holding_still": still_error.round(5).tolist()}
         return {
             "names": list(self.space.names),
             "mean_abs_error": physical.round(5).tolist(),
@@ -75,7 +75,7 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
         batch = processor.collate([samples.observation(i) for i in place])
         states = torch.from_numpy(np.stack([samples.step(i).state for i in place]))
-        draws = stack_draws([policy.sample_draws(generator) for _ in place], policy.device)
+        draws = stack_noise([policy.sampling_noise(generator) for _ in place], policy.device)
         chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()
         predicted.append(processor.absolute_actions(chunk, states))
     recorded = [samples.step(i) for i in starts]
@@ -91,12 +91,12 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
         scale=np.where(half_range > 0, half_range, 1),
-        still=np.stack([step.state for step in recorded]) if _held_by_state(processor.embodiment) else None,
+        still=np.stack([step.state for step in recorded]) if _state_is_command(processor.embodiment) else None,
         space=data.robot.action,
     )
 
 
-def _held_by_state(robot: Embodiment) -> bool:
+def _state_is_command(robot: Embodiment) -> bool:
     """Whether the state, given as the action, holds the robot still."""
     return bool(robot.action.relative) and robot.action.width == robot.state.width
 

@@ -1,13 +1,40 @@
 """AdamW, warm-up, schedule, clipping: the released recipes, number by number."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
+from timm.optim.lamb import Lamb
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
+from mme_vla.training.parallel import like
 from mme_vla.training.settings import TrainSettings
+
+
+class ClippedLamb(Lamb):
+    """timm's LAMB, scaling updates down and never up; it counts its steps in each parameter's state, as Adam does.
+
+    timm counts them in the group, which checkpoints do not keep: the correction of the moments' bias would start anew.
+    """
+
+    def __init__(self, params: Any, **options: Any) -> None:
+        super().__init__(params, trust_clip=True, max_grad_norm=None, **options)
+
+    def step(self, closure: Callable[[], float] | None = None) -> Any:
+        """One update."""
+        for group in self.param_groups:
+            counts = [self.state[p]["step"] for p in group["params"] if p in self.state and "step" in self.state[p]]
+            if counts:
+                group["step"] = counts[0].clone()
+        loss = super().step(closure)
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p in self.state:
+                    self.state[p]["step"] = group["step"].clone()
+        return loss
 
 
 def learning_rate(step: int, peak: float, warmup: int) -> float:
@@ -43,13 +70,11 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) 
     LAMB scales each tensor's update down to that tensor's norm, never up. Parameters of fewer than `decay_min_dim`
     dimensions (biases, norms) are a group of their own, without weight decay.
     """
-    found, least = list(parameters), settings.decay_min_dim
-    decayed: dict[str, Any] = {"params": [p for p in found if p.ndim >= least]}
-    others: dict[str, Any] = {"params": [p for p in found if p.ndim < least], "weight_decay": 0.0}
+    parameters_list, least = list(parameters), settings.decay_min_dim
+    decayed: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim >= least]}
+    others: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim < least], "weight_decay": 0.0}
     groups = [group for group in (decayed, others) if group["params"]]
     if settings.optimizer == "lamb":
-        from mme_vla.training.lamb import ClippedLamb
-
         return ClippedLamb(
             groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay
         )
@@ -69,3 +94,72 @@ def clip_gradients(gradients: list[Tensor], max_norm: float) -> Tensor:
     norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     torch._foreach_mul_(gradients, (max_norm / norm).clamp(max=1.0))
     return norm
+
+
+class EMA:
+    """average ← decay·average + (1 − decay)·weights after every update, begun with the initial weights as released."""
+
+    def __init__(
+        self,
+        parameters: Mapping[str, nn.Parameter],
+        decay: float,
+        warmup: bool = False,
+        reshard: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Begin with copies of the parameters; of sharded ones, every process of its own part.
+
+        Args:
+            decay: of the average; with `warmup` at most, and (1 + k)/(10 + k) after k updates before (0 at first).
+            reshard: lets go of weights that were gathered from the parameters before they change.
+        """
+        self.decay, self.warmup, self._reshard = decay, warmup, reshard
+        self._parameters = dict(parameters)
+        self._average = [p.detach().clone() for p in self._parameters.values()]
+
+    def decay_after(self, done: int) -> float:
+        """The decay of the update before which `done` were done; the first one copies, while warming up."""
+        if not self.warmup:
+            return self.decay
+        return min((1 + done) / (10 + done), self.decay) if done else 0.0
+
+    @torch.no_grad()
+    def update(self, done: int = 0) -> None:
+        """Move towards the current weights, after `done` earlier updates (which only a warm-up asks)."""
+        torch._foreach_lerp_(self._average, list(self._parameters.values()), 1 - self.decay_after(done))
+
+    @torch.no_grad()
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take the averages from `tensors`, which must name every parameter."""
+        for name, average in zip(self._parameters, self._average, strict=True):
+            average.copy_(like(average, tensors[name]))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The averages by parameter name."""
+        return dict(zip(self._parameters, self._average, strict=True))
+
+    @contextmanager
+    def applied(self) -> Iterator[None]:
+        """Within this context the module has the averaged weights.
+
+        Storage is exchanged and nothing copied, but for shards: what gathers them holds on to their storage, so their
+        numbers are exchanged.
+        """
+        self._exchange()
+        try:
+            yield
+        finally:
+            self._exchange()
+
+    @torch.no_grad()
+    def _exchange(self) -> None:
+        self._reshard()
+        for i, parameter in enumerate(self._parameters.values()):
+            average = self._average[i]
+            if isinstance(parameter, DTensor) and isinstance(average, DTensor):
+                local, other = parameter.to_local(), average.to_local()
+                copy = local.clone()
+                local.copy_(other)
+                other.copy_(copy)
+            else:
+                parameter.data, self._average[i] = average, parameter.data
+        self._reshard()

@@ -1,11 +1,15 @@
-"""Everything random in training, as a function of (seed, step): nothing has to be replayed to resume."""
+"""Batch order, random numbers and validation loss as functions of (seed, step): resuming replays nothing."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
+import numpy as np
 import torch
+from torch import Tensor
 
 from mme_vla.errors import UserError
+from mme_vla.policy.base import Policy
 
 
 def seed_of(*key: int | str) -> int:
@@ -35,11 +39,7 @@ class BatchOrder:
         process: int = 0,
         processes: int = 1,
     ) -> None:
-        """Order `samples` samples for the updates `steps`.
-
-        Raises:
-            UserError: too few samples for one batch, or a batch that does not divide over processes and pieces.
-        """
+        """Order `samples` samples for the updates `steps`."""
         if samples < batch_size:
             raise UserError(
                 f"The training split has {samples} samples, fewer than train.batch_size={batch_size}: "
@@ -77,3 +77,83 @@ class BatchOrder:
 
     def __len__(self) -> int:
         return len(self.steps) * self.accumulate
+
+
+MOST_AHEAD = 4  # batches a worker
+
+
+def size_of(item: Any) -> int:
+    """Bytes of all tensors in a sample."""
+    if isinstance(item, Tensor):
+        return item.nbytes
+    if isinstance(item, Mapping):
+        return sum(map(size_of, item.values()))
+    if isinstance(item, Sequence) and not isinstance(item, str | bytes):
+        return sum(map(size_of, item))
+    return sum(map(size_of, vars(item).values())) if hasattr(item, "__dict__") else 0
+
+
+def readers(workers: int, batch_bytes: int, most: float) -> tuple[int, int]:
+    """How many workers read, and how many batches each of them reads ahead, within `most` bytes.
+
+    Args:
+        workers: as many as may be; at least one of them reads one batch ahead, whatever its size.
+    """
+    fitting = max(int(most // max(batch_bytes, 1)), 1)
+    workers = min(workers, fitting)
+    return workers, min(fitting // workers, MOST_AHEAD) if workers else 0
+
+
+class Samples(Protocol):
+    """A map-style dataset."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Any: ...
+
+
+Collate = Callable[[Sequence[Any]], Any]
+"""Items as a batch of the policy's own kind, which has `to`."""
+
+
+class Validation:
+    """A fixed set of held-out samples, read once and kept on the CPU."""
+
+    def __init__(self, samples: Samples, collate: Collate, count: int, batch_size: int, seed: int) -> None:
+        """Choose `count` samples, evenly spaced over the split (all, if it has no more)."""
+        self._samples, self._collate, self._batch_size, self._seed = samples, collate, batch_size, seed
+        size = len(samples)
+        self.indices = np.linspace(0, size - 1, min(count, size)).round().astype(int).tolist()
+        self._batches: list[Any] = []
+
+    # Compiled code of the training step does not fit here, and a few batches are not worth code of their own.
+    @torch.compiler.set_stance("force_eager")
+    @torch.no_grad()
+    def loss(
+        self, policy: Policy, process: int = 0, processes: int = 1, reduce: Callable[..., Any] | None = None
+    ) -> float:
+        """The mean loss, without augmentation; the policy's mode is put back.
+
+        Args:
+            process, processes: which of how many this is; each takes its share of the batches. All of them run the
+                policy equally often, as sharing its weights asks: one without a batch of its own repeats its last.
+            reduce: sums a tensor over all processes (`Accelerator.reduce`), where there are several.
+        """
+        was_training = policy.training
+        policy.eval()
+        total = torch.zeros((), dtype=torch.float64)
+        places = [self.indices[i : i + self._batch_size] for i in range(0, len(self.indices), self._batch_size)]
+        mine = places[process::processes]
+        for number in range(-(-len(places) // processes)):
+            place = mine[number] if number < len(mine) else places[process % len(places)]
+            if number == len(self._batches):
+                self._batches.append(self._collate([self._samples[i] for i in place]))
+            rows = [policy.training_noise(1, generator_for(self._seed, "validation", i)) for i in place]
+            draws = {name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]}
+            loss, _ = policy(self._batches[number].to(policy.device), draws)
+            if number < len(mine):
+                total += float(loss) * len(place)
+        policy.train(was_training)
+        if reduce is not None and processes > 1:
+            total = reduce(total.to(policy.device), reduction="sum")
+        return float(total) / len(self.indices)

@@ -1,7 +1,7 @@
 """How processes share one training run: every one with all weights (DDP), or each with a part of them (FSDP2).
 
 Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of weights
-(`Policy.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
+(`Sharded.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
 `accelerate launch`.
 """
 
@@ -18,12 +18,14 @@ from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
-from mme_vla.backbone.shard_groups import float32_modules
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.base import Policy
+from mme_vla.policy.saving import recompute_buffers
+from mme_vla.speed import Sharded
+from mme_vla.speed.sharding import ShardGroup, float32_modules, stacked_layers
 
 STRATEGIES = ("auto", "ddp", "fsdp")
-WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)
+FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
 FROM_FIRST = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
 
 
@@ -41,11 +43,7 @@ class ParallelSettings:
             raise UserError(f"train.parallel.replicate={self.replicate} must be at least 1, or null.")
 
     def shards(self, device: torch.device) -> bool:
-        """Whether this run shards its weights: where that is asked for, and of itself on several GPUs.
-
-        Raises:
-            UserError: sharding is asked of a process that was not started by a launcher.
-        """
+        """Whether this run shards its weights: where that is asked for, and of itself on several GPUs."""
         started = distributed.is_available() and distributed.is_initialized()
         if self.strategy == "fsdp" and not started:
             raise UserError(
@@ -57,11 +55,7 @@ class ParallelSettings:
         return self.strategy == "fsdp"
 
     def mesh(self, device_type: str) -> DeviceMesh:
-        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis counts those.
-
-        Raises:
-            UserError: the processes do not divide into so many copies.
-        """
+        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis counts those."""
         world = distributed.get_world_size()
         nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
         copies = nodes if self.replicate is None else self.replicate
@@ -78,20 +72,21 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
     Args:
         policy: with adapters, frozen parameters, recomputation and compilation as they shall be.
         dtype: matrix products run in it (`policy.compute_dtype`). Groups are gathered in it, but for what computes in
-            float32: groups that say so, norms, and all that stands in no group.
+            float32: groups that say so, norms, and all that is in no group.
         compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are in `dtype` too.
     """
-    whole = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
-    whole = {name: tensor.detach().cpu() for name, tensor in whole.items()}
+    full = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
+    full = {name: tensor.detach().cpu() for name, tensor in full.items()}
     if distributed.get_rank() != 0:
-        policy.compute_unsaved()
+        recompute_buffers(policy)
     low = None if dtype == torch.float32 else dtype
 
     def wrap(module: nn.Module | list[nn.Module], kind: torch.dtype | None) -> None:
         rules = MixedPrecisionPolicy(param_dtype=kind, reduce_dtype=torch.float32, cast_forward_inputs=False)
         fully_shard(module, mesh=mesh, mp_policy=rules)
 
-    for group in policy.shard_groups():
+    groups = policy.shard_groups() if isinstance(policy, Sharded) else map(ShardGroup, stacked_layers(policy))
+    for group in groups:
         exact = [] if group.full or low is None or compiled else float32_modules(group.module)
         if exact:
             wrap(exact, None)
@@ -100,7 +95,7 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
             cast(FSDPModule, group.module).set_unshard_in_backward(False)
     wrap(policy, None)
     _materialise(policy, mesh)
-    set_model_state_dict(policy, whole, options=FROM_FIRST)
+    set_model_state_dict(policy, full, options=FROM_FIRST)
 
 
 def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
@@ -117,16 +112,11 @@ def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
             distributed.broadcast(buffer, 0)
 
 
-def is_sharded(module: nn.Module) -> bool:
-    """Whether a module's weights are shared (`shard`)."""
-    return isinstance(module, FSDPModule)
-
-
-def whole_state(policy: Policy) -> dict[str, Tensor]:
+def full_state(policy: Policy) -> dict[str, Tensor]:
     """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All processes call it."""
-    whole = cast(dict[str, Tensor], get_model_state_dict(policy, options=WHOLE))
-    # Trained on the CPU they may lie in what training goes on with, or in the middle of what was gathered.
-    return {name: tensor.clone() for name, tensor in whole.items()} if policy.device.type == "cpu" else whole
+    full = cast(dict[str, Tensor], get_model_state_dict(policy, options=FULL_STATE))
+    # Trained on the CPU they may lie in what training continues with, or in the middle of what was gathered.
+    return {name: tensor.clone() for name, tensor in full.items()} if policy.device.type == "cpu" else full
 
 
 def reshard(module: nn.Module) -> None:
@@ -159,17 +149,17 @@ def gathered(policy: Policy) -> Iterator[None]:
         reshard(policy)
 
 
-def like(tensor: Tensor, whole: Tensor) -> Tensor:
+def like(tensor: Tensor, full: Tensor) -> Tensor:
     """Of a whole tensor the part that this process keeps, laid out as `tensor` is; nothing is sent."""
-    if not isinstance(tensor, DTensor) or isinstance(whole, DTensor):
-        return whole
+    if not isinstance(tensor, DTensor) or isinstance(full, DTensor):
+        return full
     from torch.distributed.tensor import distribute_tensor
 
-    own = whole.to(tensor.to_local().device)
-    return distribute_tensor(own, tensor.device_mesh, tensor.placements, src_data_rank=None)
+    local = full.to(tensor.to_local().device)
+    return distribute_tensor(local, tensor.device_mesh, tensor.placements, src_data_rank=None)
 
 
-def whole_number(value: Tensor) -> Tensor:
+def full_value(value: Tensor) -> Tensor:
     """A number that processes hold parts of (a norm over shards) as the number itself."""
     return value.full_tensor() if isinstance(value, DTensor) else value
 

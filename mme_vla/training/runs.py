@@ -2,20 +2,22 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.files import FolderLock, plain
-from mme_vla.files.locks import LOCK
-from mme_vla.policy.kinds import policy_name
-from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, resolve_checkpoint, step_of
-from mme_vla.registry import INTEGRATIONS, MEMORIES, Registry
+from mme_vla.policy.base import Policy
+from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, newest_checkpoint, resolve_checkpoint, step_of
+from mme_vla.policy.saving import policy_name
+from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
+from mme_vla.utils import FolderLock, to_json
+from mme_vla.utils.locks import LOCK
+from mme_vla.weights import transfer
 
 PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
@@ -34,7 +36,7 @@ The name too: it follows from the sections that are compared, and runs of earlie
 
 @dataclass(frozen=True)
 class Run:
-    """Where a run writes, and the checkpoint it goes on from with the updates already done (None: from nothing)."""
+    """Where a run writes, and the checkpoint it continues from with the updates already done (None: from nothing)."""
 
     folder: Path
     checkpoint: Path | None = None
@@ -51,9 +53,6 @@ def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str
     Args:
         named: whether the user chose `folder`. One that is named after the clock may belong to another run that began
             in the same second: then this run takes the next name, `<folder>-2`.
-
-    Raises:
-        UserError: as `open_run`, or another process trains in the folder.
     """
     for number in range(1, 1000):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
@@ -81,10 +80,6 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     Args:
         folder: of a new run. resume: None, `auto`, or the path of a run or one of its checkpoints.
         config: the composed configuration, plain.
-
-    Raises:
-        UserError: `folder` holds another run, there is nothing to resume, or the configuration differs where it may
-            not.
     """
     if resume is None:
         if _holds_run(folder):
@@ -105,7 +100,7 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         more = [f"  … and {len(pairs) - 7:,} more"] if len(pairs) > 7 else []
         lines = "\n".join([*pairs[:7], *more])
         raise UserError(
-            f"{checkpoint} was trained with other settings, so going on from it would be another run:\n{lines}\n"
+            f"{checkpoint} was trained with other settings, so continuing from it would be another run:\n{lines}\n"
             f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."
         )
     steps = config["train"]["steps"]
@@ -116,8 +111,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     newer = [path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]]
     if newer:
         raise UserError(
-            f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which going on from {checkpoint.name} "
-            "would overwrite: resume from the newest, or move those away."
+            f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which continuing from "
+            f"{checkpoint.name} would overwrite: resume from the newest, or move those away."
         )
     return Run(checkpoint.parent.parent, checkpoint, state["step"])
 
@@ -126,24 +121,21 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
     """Make sure that a resumed run has the data it began with.
 
     Args:
-        checkpoint: it goes on from. now: `SplitData.content`.
-
-    Raises:
-        UserError: a dataset has changed. Checkpoints from before this was noted cannot tell.
+        checkpoint: it continues from. now: `SplitData.content`.
     """
     then = read_state(checkpoint)["config"].get("data", {}).get("content")
     if then is not None and list(then) != list(now):
         which = [i for i, (old, new) in enumerate(zip_longest(then, now)) if old != new]
         raise UserError(
             f"The data have changed since {checkpoint} was written: number {', '.join(map(str, which))} of "
-            "data.sources holds other episodes, so going on would be another run. Bring the data back, or start anew "
+            "data.sources holds other episodes, so continuing would be another run. Bring the data back, or start anew "
             f"with init_from={checkpoint}."
         )
 
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Dotted keys whose values differ and must not, with both values."""
-    before, after = (_flat(plain(values)) for values in (old, new))
+    before, after = (_flat(to_json(values)) for values in (old, new))
     return {
         key: (before.get(key), after.get(key))
         for key in sorted(before.keys() | after.keys())
@@ -161,6 +153,7 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         "data": _with_default_split(config.get("data") or {}),
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
+        **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
     }
 
 
@@ -168,6 +161,13 @@ def _with_default_split(data: Mapping[str, Any]) -> dict[str, Any]:
     """The section `data` as it is written now: runs on the shipped sample named the episode that is now the default."""
     is_default = list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]
     return {**data, "val_episodes": None} if is_default else dict(data)
+
+
+def _with_head(section: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `backbone` with the default flow head, where earlier versions had no other."""
+    sizes: Any = BACKBONES[section["name"]].Config if section["name"] in BACKBONES else None
+    heads = [f.default_factory for f in (fields(sizes) if is_dataclass(sizes) else ()) if f.name == "head"]
+    return ({"head": heads[0]()} if heads and heads[0] is not MISSING else {}) | dict(section)
 
 
 def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str, Any]:
@@ -202,7 +202,35 @@ def _newest_unfinished(folder: Path) -> Path | None:
     beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
     runs = [folder, *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)]
     for run in runs:
-        found = checkpoints_in(run / CHECKPOINTS)
-        if found:
-            return None if (run / SUMMARY).is_file() and run != folder else found[-1]
+        checkpoints = checkpoints_in(run / CHECKPOINTS)
+        if checkpoints:
+            return None if (run / SUMMARY).is_file() and run != folder else checkpoints[-1]
     return None
+
+
+ASK, NONE = "ask", "none"
+
+
+def weights_to_start_from(init_from: str | None) -> str | None:
+    """What `init_from` names; None for random weights."""
+    if init_from == ASK:
+        raise UserError(
+            "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
+            "To train the whole network from random weights, say so: init_from=none."
+        )
+    return None if init_from in (None, NONE) else init_from
+
+
+def start_from(policy: Policy, source: str) -> str:
+    """Copy every weight that `source` holds into a freshly built policy; only its memory's own may be new.
+
+    Args:
+        source: a checkpoint of any format (`mme_vla.weights`), or one of this library's run folders, which means
+            its newest checkpoint.
+
+    Returns:
+        A sentence that says what was taken, what is new and what was left behind.
+    """
+    newest = newest_checkpoint(Path(source))
+    source = source if newest == Path(source) else str(newest)
+    return f"weights from {source}: {transfer(policy, source)}"

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from mme_vla.backbone.layers.recomputing import ALL, SELECTIVE, Recompute
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
+from mme_vla.speed.recompute import ALL, SELECTIVE, Recompute
 from mme_vla.training.parallel import ParallelSettings
 
 SCHEDULES = ("constant", "cosine", "steps")
@@ -65,11 +65,7 @@ class TrainSettings:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], seed: int = 42) -> Self:
-        """Read the section `train` of a composed configuration.
-
-        Raises:
-            UserError: an unknown key or an impossible value.
-        """
+        """Read the section `train` of a composed configuration."""
         return read_section(cls, values, "train", seed=seed)
 
     def __post_init__(self) -> None:
@@ -81,8 +77,8 @@ class TrainSettings:
         if self.schedule_steps is not None:
             fits = self.schedule_steps >= max(self.warmup, 1)
             _check("schedule_steps", self.schedule_steps, fits, f"no fewer than train.warmup={self.warmup}, or null")
-        whole = all(isinstance(step, int) and step >= 1 for step in self.milestones)
-        _check("milestones", list(self.milestones), whole and list(self.milestones) == sorted(self.milestones),
+        valid = all(isinstance(step, int) and step >= 1 for step in self.milestones)
+        _check("milestones", list(self.milestones), valid and list(self.milestones) == sorted(self.milestones),
                "updates in ascending order, such as [1000, 2000]")  # fmt: skip
         _check("gamma", self.gamma, 0 < self.gamma <= 1, "above 0 and at most 1")
         for name in ("warmup", "decay_min_dim", "workers", "val_samples", "open_loop_chunks", "weight_decay"):

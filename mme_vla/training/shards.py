@@ -24,9 +24,9 @@ from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
 from torch.distributed.tensor import DTensor
 
 from mme_vla.errors import UserError, listed
-from mme_vla.files import Sums, decoding, inside, sum_line
 from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
+from mme_vla.utils import Sums, decoding, inside, sum_line
 
 SHARDS = "shards"
 RAW, AVERAGE, STEPS = "raw", "average", "steps"
@@ -40,7 +40,7 @@ def shard_files(checkpoint: Path) -> list[Path]:
 
 
 class ShardWriter:
-    """Writes parts in a thread while training goes on; one checkpoint at a time. All processes call each method."""
+    """Writes parts in a thread while training continues; one checkpoint at a time. All processes call each method."""
 
     def __init__(self) -> None:
         self._group = distributed.new_group(backend="gloo")
@@ -114,9 +114,6 @@ def read_shards(
 
     Returns:
         Adam's moments and counts as `<name>/<key>`, of those parameters that had any.
-
-    Raises:
-        UserError: a damaged file, or tensors that do not fit this policy.
     """
     tensors = training_tensors(policy, averages, optimizer, trained)
     _load(checkpoint, tensors, alone=not any(isinstance(tensor, DTensor) for tensor in tensors.values()))
@@ -129,14 +126,10 @@ def read_shards(
 
 
 def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
-    """The trained weights themselves of a whole policy (built on meta or not), by name, on the CPU.
-
-    Raises:
-        UserError: a damaged file, or tensors that do not fit this policy.
-    """
-    found = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
-    _load(checkpoint, found, alone=True, others=True)
-    return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in found.items()}
+    """The trained weights themselves of a whole policy (built on meta or not), by name, on the CPU."""
+    tensors = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
+    _load(checkpoint, tensors, alone=True, others=True)
+    return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in tensors.items()}
 
 
 def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: bool = False) -> None:
@@ -149,9 +142,9 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     reader = dcp.HuggingFaceStorageReader(str(folder))
     with _decoding(folder):
         stored = {name: about.size for name, about in reader.read_metadata().state_dict_metadata.items()}  # type: ignore[union-attr]
-    wanted = {name: tensor.shape for name, tensor in tensors.items()}
-    names = set(wanted) - set(stored) if others else set(wanted) ^ set(stored)
-    wrong = sorted(names | {name for name in wanted.keys() & stored.keys() if wanted[name] != stored[name]})
+    shapes = {name: tensor.shape for name, tensor in tensors.items()}
+    names = set(shapes) - set(stored) if others else set(shapes) ^ set(stored)
+    wrong = sorted(names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]})
     if wrong:
         raise UserError(
             f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
@@ -163,16 +156,12 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     except CheckpointException as error:  # what the processes met with, by their numbers
         with _decoding(folder):
             raise next(iter(error.failures.values()))[0] from error
-    own = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
-    check_values(own, str(folder))
+    local = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
+    check_values(local, str(folder))
 
 
 def _sums_of(checkpoint: Path, file: Path) -> Sums:
-    """The checksum of a shard, which every process writes beside its own.
-
-    Raises:
-        UserError: there is none, or a file that cannot be a shard.
-    """
+    """The checksum of a shard, which every process writes beside its own."""
     note = file.with_suffix(".sha256")
     for path in (file, note):
         inside(checkpoint, path.relative_to(checkpoint).as_posix())

@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import distributed
 
-from mme_vla.files.parents import end_with_parent
+from mme_vla.utils.processes import end_with_parent
 
 ANSWERED = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass
-class Asked:
+class StopRequest:
     """Call it to know whether any process was asked to stop.
 
     It is a collective: all processes call it after the same update, so all get the same answer, though the signals
@@ -33,13 +33,13 @@ class Asked:
 
 
 @contextmanager
-def stop_asked() -> Iterator[Asked]:
+def stop_requests() -> Iterator[StopRequest]:
     """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual."""
-    asked = Asked(lambda: asked.event.is_set())
-    event = asked.event
-    with _signals_set(asked):
+    request = StopRequest(lambda: request.event.is_set())
+    event = request.event
+    with _signals_set(request):
         if not _several_processes():
-            yield asked
+            yield request
             return
         # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
         group = distributed.new_group(backend="gloo")
@@ -49,9 +49,9 @@ def stop_asked() -> Iterator[Asked]:
             distributed.all_reduce(flag, distributed.ReduceOp.MAX, group)
             return bool(flag)
 
-        asked.anyone = anyone
+        request.anyone = anyone
         try:
-            yield asked
+            yield request
         finally:
             distributed.destroy_process_group(group)
 
@@ -71,7 +71,7 @@ def _several_processes() -> bool:
 
 
 @contextmanager
-def _signals_set(asked: Asked) -> Iterator[None]:
+def _signals_set(request: StopRequest) -> Iterator[None]:
     """Each signal asks, once; only a main thread may answer signals, in any other nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -79,8 +79,8 @@ def _signals_set(asked: Asked) -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in ANSWERED}
 
     def ask(number: int, frame: Any) -> None:
-        asked.signal = number
-        asked.event.set()
+        request.signal = number
+        request.event.set()
         signal.signal(number, before[signal.Signals(number)])
 
     for number in before:

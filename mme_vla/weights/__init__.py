@@ -1,7 +1,7 @@
 """Checkpoints of every format: one adapter each, over the name tables that the rooms below supply."""
 
-from mme_vla.weights.foreign_statistics import read_stats
 from mme_vla.weights.load import load_weights, start_from, transfer
 from mme_vla.weights.source import detect_format, open_source
+from mme_vla.weights.statistics import read_stats
 
 __all__ = ["detect_format", "load_weights", "open_source", "read_stats", "start_from", "transfer"]

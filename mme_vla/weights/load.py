@@ -1,4 +1,4 @@
-"""The front door: any checkpoint into a policy, whole or as a start for another variant."""
+"""Load any checkpoint into a policy, completely or as a start for another variant."""
 
 import re
 import warnings
@@ -10,30 +10,31 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.files import inside, read_json
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
+from mme_vla.policy.saving import recompute_buffers
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
-from mme_vla.weights.adapter import Adapter, memory_parameters
-from mme_vla.weights.diffusion_policy import diffusion_adapter
-from mme_vla.weights.foreign_statistics import read_stats, stats_files
-from mme_vla.weights.memoryvla import memoryvla_adapter
-from mme_vla.weights.openvla import openvla_adapter
+from mme_vla.utils import inside, read_json
 from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
-from mme_vla.weights.sam2act_files import sam2act_adapter
-from mme_vla.weights.source import Source, open_source
+from mme_vla.weights.source import METHOD_FORMATS, Source, open_source
+from mme_vla.weights.statistics import read_stats, stats_files
+from mme_vla.weights.tables import Adapter, memory_parameters
 
-ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
+_ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "lerobot": port_adapter,
     "openpi": port_adapter,
     "released": released_adapter,
-    "diffusion_policy": diffusion_adapter,
-    "sam2act_plus": sam2act_adapter,
-    "openvla": openvla_adapter,
-    "memoryvla": memoryvla_adapter,
 }
+
+
+def adapter_of(fmt: str, policy: Policy) -> Adapter:
+    """The name table of a format for a policy; raises an error where the format does not hold such a policy."""
+    make = _ADAPTERS[fmt] if fmt in _ADAPTERS else METHOD_FORMATS[fmt].function("adapter")
+    adapter: Adapter = make(policy)
+    return adapter
+
 
 # What a memory adds to a policy, as our names, the released leaves, LeRobot's own memory and MemoryVLA's banks tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
@@ -65,41 +66,37 @@ def load_weights(
             or misshapen is listed, and nothing is changed.
     """
     kind = dtype_of(dtype)
-    found = open_source(source, revision, token, base)
-    if found.format == "openpi" and policy.memory is not None:
+    checkpoint = open_source(source, revision, token, base)
+    if checkpoint.format == "openpi" and policy.memory is not None:
         raise UserError(
             f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
             "To begin training from it use start_from() (on the command line: init_from=…)."
         )
-    stats, datasets = None, list(stats_files(found.folder))
-    if policy.processor is not None and found.format != "lerobot" and len(datasets) < 2:
-        stats = read_stats(found.folder)
-    assign_tensors(policy, read_as(policy, found), str(source), kind)
-    policy.compute_unsaved()
+    stats, datasets = None, list(stats_files(checkpoint.folder))
+    if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
+        stats = read_stats(checkpoint.folder)
+    assign_tensors(policy, read_as(policy, checkpoint), str(source), kind)
+    recompute_buffers(policy)
     if stats is not None and policy.processor is not None:
         policy.processor.stats = stats
     elif len(datasets) > 1:
         warnings.warn(
             f"{source} holds normalisation statistics of {', '.join(datasets)}; none were taken. Choose one: "
-            f"policy.processor.stats = read_stats({str(found.folder)!r}, {datasets[0]!r})",
+            f"policy.processor.stats = read_stats({str(checkpoint.folder)!r}, {datasets[0]!r})",
             stacklevel=2,
         )
     return policy
 
 
 def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
-    """Read a checkpoint in the names of a policy of its own variant.
-
-    Raises:
-        UserError: as `load_weights`.
-    """
+    """Read a checkpoint in the names of a policy of its own variant."""
     if source.format == "ours":
         return merge_state(source.tensors(), source.config.get("adapters"))
     if source.format == "lerobot":
         check_window(policy, source.config, str(source.folder))
-    adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
-    tensors = source.tensors(lambda found: adapter.check_fit(found, state, source.shown))
-    return adapter.translate(tensors, state, source.shown)
+    adapter, state = adapter_of(source.format, policy), policy.state_dict()
+    tensors = source.tensors(lambda values: adapter.check_fit(values, state, source.label))
+    return adapter.translate(tensors, state, source.label)
 
 
 @dataclass(frozen=True)
@@ -124,9 +121,6 @@ def start_from(policy: Policy, source: str | Path, *, revision: str | None = Non
 
     The source may be memoryless π0.5 in any format, or another variant. Only parameters of the memory (its integration
     and its own expert included) may stay new; they keep the values they have. Statistics are not taken.
-
-    Raises:
-        UserError: no checkpoint, a weight of another shape, or weights missing that are not the memory's.
     """
     return transfer(policy, source, revision=revision).new
 
@@ -135,44 +129,48 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
     """Do what `start_from` says, and tell in full what was taken, what is new and what was left behind."""
     if policy.device.type == "meta":
         raise UserError("Build the policy on a real device to start from a checkpoint: its memory needs fresh values.")
-    found = open_source(source, revision)
-    own, state = memory_parameters(policy), policy.state_dict()
-    if found.format == "ours":
-        theirs = merge_state(found.tensors(), found.config.get("adapters"))
-        _check_tokenizer(policy, found.folder)
-        strange = set(theirs) - set(state)
+    checkpoint = open_source(source, revision)
+    memory_names, state = memory_parameters(policy), policy.state_dict()
+    if checkpoint.format == "ours":
+        source_tensors = merge_state(checkpoint.tensors(), checkpoint.config.get("adapters"))
+        _check_tokenizer(policy, checkpoint.folder)
+        strange = set(source_tensors) - set(state)
         left = sorted(name for name in strange if _OF_MEMORY.search(name) or _part(policy, name) == "memory")
-        ours = {name: tensor for name, tensor in theirs.items() if name not in left}
-        check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
+        matched = {name: tensor for name, tensor in source_tensors.items() if name not in left}
+        check_fit(
+            matched, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=memory_names
+        )
     else:
-        of_format = partial_adapter(policy) if found.format == "released" else ADAPTERS[found.format](policy)
-        own |= of_format.fresh
+        of_format = (
+            partial_adapter(policy) if checkpoint.format == "released" else adapter_of(checkpoint.format, policy)
+        )
+        memory_names |= of_format.fresh
         members = [place for place, _ in members_of(policy.memory)]
 
-        def behind(theirs: Mapping[str, Tensor]) -> list[str]:
+        def behind(tensors: Mapping[str, Tensor]) -> list[str]:
             known = {constant.path for constant in of_format.derived}
-            known |= set(_reduced(of_format, own, members, theirs).shapes(state))
-            return sorted(name for name in set(theirs) - known if _MEMORY_LEAF.search(name))
+            known |= set(_reduced(of_format, memory_names, members, tensors).shapes(state))
+            return sorted(name for name in set(tensors) - known if _MEMORY_LEAF.search(name))
 
-        def fits(theirs: Mapping[str, Tensor]) -> None:
-            left = set(behind(theirs))
-            here = {name: tensor for name, tensor in theirs.items() if name not in left}
-            _reduced(of_format, own, members, theirs).check_fit(here, state, str(source))
+        def fits(tensors: Mapping[str, Tensor]) -> None:
+            left = set(behind(tensors))
+            here = {name: tensor for name, tensor in tensors.items() if name not in left}
+            _reduced(of_format, memory_names, members, tensors).check_fit(here, state, str(source))
 
-        theirs = found.tensors(fits)
-        left = behind(theirs)
-        adapter = _reduced(of_format, own, members, theirs)
-        theirs = {name: tensor for name, tensor in theirs.items() if name not in left}
-        ours = adapter.translate(theirs, state, str(source))
-    check_kinds(ours, state, str(source))
-    check_values(ours, str(source))
-    policy.load_state_dict(ours, strict=False)
-    return Start(sorted(ours), sorted(set(state) - set(ours)), left)
+        source_tensors = checkpoint.tensors(fits)
+        left = behind(source_tensors)
+        adapter = _reduced(of_format, memory_names, members, source_tensors)
+        source_tensors = {name: tensor for name, tensor in source_tensors.items() if name not in left}
+        matched = adapter.translate(source_tensors, state, str(source))
+    check_kinds(matched, state, str(source))
+    check_values(matched, str(source))
+    policy.load_state_dict(matched, strict=False)
+    return Start(sorted(matched), sorted(set(state) - set(matched)), left)
 
 
 def _part(policy: Policy, name: str) -> str | None:
     """The part of a policy that another's parameter would belong to; None where it has none such."""
-    return next((part for part, pattern in policy.parts().items() if re.match(pattern, name)), None)
+    return next((part for part, pattern in policy.finetune_spec.components.items() if re.match(pattern, name)), None)
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:
@@ -180,23 +178,28 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     file = folder / CONFIG_FILE
     if policy.processor is None or not file.is_file():
         return
-    theirs = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
-    processor, ours = policy.processor, policy.processor.words_fingerprint
-    if theirs is not None and ours is not None and theirs != ours:
+    source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
+    processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
+    if source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {processor.words_from!r} ({ours}): "
-            "its ids would mean other words. Set processor.tokenizer to that one."
+            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than "
+            f"{processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other words. Set "
+            "processor.tokenizer to that one."
         )
 
 
-def _reduced(adapter: Adapter, own: set[str], members: Sequence[str], theirs: Mapping[str, Tensor]) -> Adapter:
+def _reduced(
+    adapter: Adapter, local: set[str], members: Sequence[str], source_tensors: Mapping[str, Tensor]
+) -> Adapter:
     """Leave out the memory's parameters that the checkpoint does not hold, and members that it does not hold whole."""
-    absent = {name for name, pieces in adapter.table.items() if not all(piece.path in theirs for piece in pieces)}
+    absent = {
+        name for name, pieces in adapter.table.items() if not all(piece.path in source_tensors for piece in pieces)
+    }
     torn = tuple(f"{place}." for place in members if any(name.startswith(f"{place}.") for name in absent))
     table = {
         name: pieces
         for name, pieces in adapter.table.items()
-        if name not in own or (name not in absent and not name.startswith(torn))
+        if name not in local or (name not in absent and not name.startswith(torn))
     }
     return replace(adapter, table=table)
 

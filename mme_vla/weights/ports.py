@@ -12,12 +12,12 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.spacetime import SpaceTime
+from mme_vla.memory.base import past_view_spec
+from mme_vla.memory.extensions.spacetime import SpaceTime
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.weights.adapter import Adapter, pi05_of
-from mme_vla.weights.name_tables import Piece, prefixed
 from mme_vla.weights.names import torch_backbone as names
+from mme_vla.weights.tables import Adapter, Piece, pi05_of, prefixed
 
 LEROBOT_PREFIX = "model."
 _VLM = rf"^{names.ROOT}\.paligemma\."
@@ -28,7 +28,7 @@ _SPELLINGS = [
     (rf"{_VLM}(vision_tower|multi_modal_projector)\.", rf"{names.ROOT}.paligemma.model.\1."),
     (rf"{_VLM}model\.vision_tower\.(?!vision_model\.)", f"{names.VISION}."),
 ]
-WINDOW_MEMORY = {"use_visual_memory": "past pictures in its vision tower", "use_proprioceptive_memory": "past states"}
+WINDOW_MEMORY = {"use_visual_memory": "past images in its vision tower", "use_proprioceptive_memory": "past states"}
 """LeRobot's short-window memory of π0.5, by the settings that turn it on; the first adds no tensors."""
 HISTORY = "proprio_history_proj"
 """The tensors that the second adds."""
@@ -48,7 +48,7 @@ def port_adapter(policy: MMEPolicy) -> Adapter:
     """
     table = prefixed("backbone", names.torch_names(pi05_of(policy)))
     memory = policy.memory
-    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == policy.backbone.token_width:
+    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == pi05_of(policy).config.vlm.width:
         table |= {f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")}
     return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
 
@@ -59,27 +59,23 @@ def is_port(tensor_names: list[str]) -> bool:
 
 
 def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Bring a port's tensors to the one spelling of the name table, the embedding under its own name.
-
-    Raises:
-        UserError: two tensors that mean the same one, or a checkpoint of π0, whose network is another.
-    """
+    """Bring a port's tensors to the one spelling of the name table, the embedding under its own name."""
     spelled: dict[str, str] = {}
     for name in tensors:
         taken = spelled.setdefault(_respell(name), name)
         if taken != name:
             raise UserError(f"{source} holds the same tensor twice, as {taken} and as {name}.")
-    found = {name: tensors[theirs] for name, theirs in spelled.items()}
-    adaptive = any(name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in found)
-    if not adaptive or any(_PI0.match(name) for name in found):
+    renamed = {name: tensors[source_name] for name, source_name in spelled.items()}
+    adaptive = any(name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in renamed)
+    if not adaptive or any(_PI0.match(name) for name in renamed):
         raise UserError(
             f"{source} is not π0.5: its action expert has "
             + ("a state projection" if adaptive else "no time-conditioned norms")
             + ", as π0 has. Only π0.5 checkpoints fit."
         )
-    if names.EMBEDDING not in found and names.HEAD in found:
-        found[names.EMBEDDING] = found[names.HEAD]
-    return found
+    if names.EMBEDDING not in renamed and names.HEAD in renamed:
+        renamed[names.EMBEDDING] = renamed[names.HEAD]
+    return renamed
 
 
 def window_of(policy: Policy) -> dict[str, bool | int]:
@@ -87,17 +83,16 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
     memory = policy.memory
     if not isinstance(memory, SpaceTime):
         return dict.fromkeys(WINDOW_MEMORY, False)
-    look = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
-    seen = {"use_visual_memory": memory.looks_back is not None, "use_proprioceptive_memory": memory.states is not None}
-    return seen | {theirs: look[ours] for theirs, (ours, _) in WINDOW.items()}
+    settings = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
+    memory_settings = {
+        "use_visual_memory": past_view_spec(memory) is not None,
+        "use_proprioceptive_memory": memory.states is not None,
+    }
+    return memory_settings | {source_name: settings[target_name] for source_name, (target_name, _) in WINDOW.items()}
 
 
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's.
-
-    Raises:
-        UserError: its `config.json` turns on a memory that the policy does not have, or has otherwise.
-    """
+    """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's."""
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
     if not any(has.values()) and policy.memory is not None:
         raise UserError(
@@ -105,7 +100,7 @@ def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None
             "To begin training from it use start_from() (on the command line: init_from=…)."
         )
     if any(has.values()):
-        has |= {theirs: config.get(theirs, usual) for theirs, (_, usual) in WINDOW.items()}
+        has |= {source_name: config.get(source_name, default) for source_name, (_, default) in WINDOW.items()}
     between = getattr(getattr(policy, "integration", None), "mutual", False)
     if any(window_of(policy).get(setting) != value for setting, value in has.items()) or (
         has["use_proprioceptive_memory"] and not between
@@ -115,17 +110,19 @@ def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None
 
 def _other_window(has: Mapping[str, Any], source: str) -> str:
     """What a policy has to be to load a checkpoint with these settings."""
-    seen = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
+    kinds = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
     views, states = (str(has[setting]).lower() for setting in WINDOW_MEMORY)
     integration = (
         "integration=context integration.mutual=true" if has["use_proprioceptive_memory"] else "integration=none"
     )
-    look = " ".join(f"memory.{ours}={brief(has[theirs])}" for theirs, (ours, _) in WINDOW.items())
+    window = " ".join(
+        f"memory.{target_name}={brief(has[source_name])}" for source_name, (target_name, _) in WINDOW.items()
+    )
     frames, stride = (brief(has[key]) for key in ("memory_frames", "memory_stride"))
     return (
-        f"{source} reads {' and '.join(seen)} (LeRobot's short-window memory: memory_frames={frames}, memory_stride="
+        f"{source} reads {' and '.join(kinds)} (LeRobot's short-window memory: memory_frames={frames}, memory_stride="
         f"{stride}), which this policy does not, or not so: whole, it would act on other things than it was trained "
-        f"with. Build the one that does: memory=spacetime {integration} {look} memory.views={views} "
+        f"with. Build the one that does: memory=spacetime {integration} {window} memory.views={views} "
         f"memory.states={states}. To begin training another from its weights use start_from() (on the command line: "
         "init_from=…)."
     )

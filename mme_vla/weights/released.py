@@ -17,16 +17,11 @@ from mme_vla.memory.base import Memory
 from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors
-from mme_vla.weights.adapter import Adapter, memory_parameters, pi05_of
-from mme_vla.weights.name_tables import Derived, NameTable, Unread, prefixed
+from mme_vla.weights.tables import Adapter, Derived, NameTable, Unread, memory_parameters, pi05_of, prefixed
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
-    """The released tree of this policy.
-
-    Raises:
-        UserError: memory or integration are not released ones.
-    """
+    """The released tree of this policy."""
     return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
 
 
@@ -41,7 +36,11 @@ def partial_adapter(policy: Any) -> Adapter:
         table |= prefixed(place, memory_names.released_names(member))
         unread += memory_names.released_unread(member)
         derived += memory_names.released_derived(member)
-    known = {name: pieces for name, pieces in table.items() if name in state or policy.part_of(name) != "memory"}
+    known = {
+        name: pieces
+        for name, pieces in table.items()
+        if name in state or policy.finetune_spec.component_of(name) != "memory"
+    }
     return Adapter(known, unread, derived=derived)
 
 
@@ -53,13 +52,11 @@ def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
 
 
 def released_table(policy: MMEPolicy) -> NameTable:
-    """Every parameter of the policy and the released leaves it is made of.
-
-    Raises:
-        UserError: memory or integration have tensors that no released checkpoint holds.
-    """
+    """Every parameter of the policy and the released leaves it is made of."""
     table = _table(policy)
-    unnamed = sorted(memory_parameters(policy) ^ {name for name in table if policy.part_of(name) == "memory"})
+    unnamed = sorted(
+        memory_parameters(policy) ^ {name for name in table if policy.finetune_spec.component_of(name) == "memory"}
+    )
     if unnamed:
         owners = [part for part in (policy.memory, policy.integration) if part is not None]
         raise UserError(
@@ -89,11 +86,7 @@ def released_derived(policy: MMEPolicy) -> list[Derived]:
 
 
 def from_released(policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree") -> MMEPolicy:
-    """Fill a policy (on meta or not) from a released tree.
-
-    Raises:
-        UserError: lists every leaf that is missing, left over or misshapen.
-    """
+    """Fill a policy (on meta or not) from a released tree."""
     assign_tensors(policy, released_adapter(policy).translate(tree, policy.state_dict(), source), source)
     return policy
 

@@ -1,6 +1,7 @@
 """What a user points at: which format it is in, and its tensors under that format's names."""
 
-from collections.abc import Callable, Mapping, Sequence
+import importlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,17 +9,19 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.policy.hub import local_folder
-from mme_vla.policy.saving import CONFIG, read_config
+from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
-from mme_vla.weights.archive import SUFFIX, find_archive, open_archive
-from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
-from mme_vla.weights.lora_runs import FOLDER, has_adapters, merged, named_base
-from mme_vla.weights.memoryvla import is_memoryvla, read_names
-from mme_vla.weights.openvla import is_openvla, with_heads
-from mme_vla.weights.orbax import Zipped, find_params, read_orbax, variant_of
+from mme_vla.utils import decoding, require_file
+from mme_vla.weights.orbax import (
+    ARCHIVE_SUFFIX,
+    Zipped,
+    find_archive,
+    find_params,
+    open_archive,
+    read_orbax,
+    variant_of,
+)
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
-from mme_vla.weights.sam2act_files import is_sam2act, plain_sam2act_names
 from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
 
 FORMATS = {
@@ -34,22 +37,53 @@ FORMATS = {
 
 
 @dataclass(frozen=True)
-class OwnNames:
-    """A format of one method, told by its tensors' names.
+class MethodFormat:
+    """A format of one method: where the functions are that read and write it, imported when first used.
 
-    matches: whether names are its. plain: tensors under the one spelling that its name table knows.
+    matches: whether tensor names are its. adapter: its name table for a policy. write: a policy as its files.
+    native: tensors under the one spelling of the name table, for files of `torch.save`. stats: reads its statistics.
     """
 
-    matches: Callable[[Sequence[str]], bool]
-    plain: Callable[[Mapping[str, Tensor], str], dict[str, Tensor]]
+    module: str
+    matches: str
+    adapter: str
+    write: str
+    native: str | None = None
+    stats: str | None = None
+
+    def function(self, role: str) -> Callable[..., Any]:
+        """Import one of the functions."""
+        name: str = getattr(self, role)
+        function: Callable[..., Any] = getattr(importlib.import_module(self.module), name)
+        return function
 
 
-OWN_NAMES = {
-    "diffusion_policy": OwnNames(is_diffusion_policy, plain_names),
-    "sam2act_plus": OwnNames(is_sam2act, plain_sam2act_names),
-    "memoryvla": OwnNames(is_memoryvla, read_names),
-}
+METHOD_FORMATS = {
+    "diffusion_policy": MethodFormat(
+        "mme_vla.methods.diffusion_policy.weights", "is_diffusion_policy", "diffusion_adapter",
+        "write_diffusion_policy", native="unwrap_names", stats="read_diffusion_stats",
+    ),
+    "sam2act_plus": MethodFormat(
+        "mme_vla.methods.sam2act.weights", "is_sam2act", "sam2act_adapter", "write_sam2act",
+        native="unwrap_sam2act_names",
+    ),
+    "memoryvla": MethodFormat(
+        "mme_vla.methods.memoryvla.weights", "is_memoryvla", "memoryvla_adapter", "write_memoryvla",
+        native="read_names",
+    ),
+    "openvla": MethodFormat(
+        "mme_vla.methods.openvla_oft.weights", "is_openvla", "openvla_adapter", "write_openvla",
+        stats="read_dataset_statistics",
+    ),
+}  # fmt: skip
+NATIVE_FORMATS = [name for name, of in METHOD_FORMATS.items() if of.native]
 """Formats in files of `torch.save`; each is called as the model it holds."""
+
+
+def _openvla() -> Any:
+    """The reader of OpenVLA-OFT's adapters and heads, which lie in files of their own."""
+    return importlib.import_module(METHOD_FORMATS["openvla"].module)
+
 
 VARIANTS = {
     "pi05_baseline": "pi05",
@@ -86,24 +120,23 @@ class Source:
         Args:
             fits: where reading takes memory (Orbax), called before with tensors of the same names and shapes on meta;
                 raises where they do not fit.
-
-        Raises:
-            UserError: a file that is damaged, incomplete or of another network.
         """
         if self.params is not None:
             return read_orbax(self.params, fits)
-        if self.format in OWN_NAMES:
-            return OWN_NAMES[self.format].plain(read_torch_file(self.files[0]), str(self.files[0]))
+        if self.format in NATIVE_FORMATS:
+            to_native = METHOD_FORMATS[self.format].function("native")
+            native: dict[str, Tensor] = to_native(read_torch_file(self.files[0]), str(self.files[0]))
+            return native
         if self.base is not None:
-            own = with_heads({}, self.folder)
-            return merged(self.base.tensors(), self.folder) | own
+            heads: dict[str, Tensor] = _openvla().with_heads({}, self.folder)
+            return _openvla().merged(self.base.tensors(), self.folder) | heads
         tensors = read_files(self.folder, self.files)
         if self.format == "openvla":
-            return with_heads(tensors, self.folder)
+            tensors = _openvla().with_heads(tensors, self.folder)
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
-    def shown(self) -> str:
+    def label(self) -> str:
         """Where it is, for messages."""
         return str(self.params if isinstance(self.params, Zipped) else self.folder)
 
@@ -115,32 +148,28 @@ class Source:
     @property
     def model(self) -> str | None:
         """Our name of the variant a checkpoint is, or None where it does not say."""
-        if self.format in OWN_NAMES:
+        if self.format in NATIVE_FORMATS:
             return self.format
         if self.format == "openvla":
             return "openvla_oft"
-        said = None
+        name = None
         if self.params is not None:
             place = self.params.file if isinstance(self.params, Zipped) else self.params
             beside = [place.parent, place.parent.parent]
-            said = variant_of([self.folder, *beside])
-            if said is None:  # published runs lie in folders that are called as they are
-                said = next((folder.name for folder in beside if folder.name in VARIANTS), None)
-        if said is not None and said not in VARIANTS:
+            name = variant_of([self.folder, *beside])
+            if name is None:  # published runs lie in folders that are called as they are
+                name = next((folder.name for folder in beside if folder.name in VARIANTS), None)
+        if name is not None and name not in VARIANTS:
             # The word would become part of a configuration, where it could ask for more than a name.
             raise UserError(
-                f"history_config.txt beside {self.folder} says {brief(said)}, no variant of the released code. "
-                f"{did_you_mean(brief(said), VARIANTS)}"
+                f"history_config.txt beside {self.folder} says {brief(name)}, no variant of the released code. "
+                f"{did_you_mean(brief(name), VARIANTS)}"
             )
-        return None if said is None else VARIANTS[said]
+        return None if name is None else VARIANTS[name]
 
 
 def detect_format(source: str | Path) -> str:
-    """Say what `source` is: `ours`, `lerobot`, `openpi` or `released`.
-
-    Raises:
-        UserError: nothing there, or nothing this library knows.
-    """
+    """Say what `source` is: `ours`, `lerobot`, `openpi` or `released`."""
     return open_source(source).format
 
 
@@ -153,26 +182,27 @@ def open_source(
 
     Args:
         base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for it is not followed.
-
-    Raises:
-        UserError: nothing there, or nothing this library knows; adapters without a base, or a base without adapters.
     """
     path = local_folder(source, revision, token)
     if not path.exists():
         raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
-    whole = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
+    if not path.is_dir():
+        require_file(path, "a checkpoint")
+    is_local = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
     if base is not None:
-        if whole or not has_adapters(path):
+        if is_local or not _openvla().has_adapters(path):
             raise UserError(
-                f"base={str(base)!r} is for a run that holds {FOLDER} alone; {path} does not: leave it out."
+                f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does not: leave it out."
             )
-        found = open_source(base)
-        if found.format != "openvla":
-            raise UserError(f"base={str(base)!r} is {FORMATS[found.format]}; the adapters in {path} are OpenVLA's.")
-        return Source("openvla", path, base=found)
+        base_source = open_source(base)
+        if base_source.format != "openvla":
+            raise UserError(
+                f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are OpenVLA's."
+            )
+        return Source("openvla", path, base=base_source)
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
-    if path.is_file() and path.suffix == SUFFIX:
+    if path.is_file() and path.suffix == ARCHIVE_SUFFIX:
         return _of_archive(path)
     if path.is_file():
         return _of_files(path.parent, (path,))
@@ -183,10 +213,11 @@ def open_source(
         return Source("released", params.parent if params.name == "params" else params, params=params)
     if (zipped := find_archive(path)) is not None:
         return _of_archive(zipped)
-    if has_adapters(path):
+    if _openvla().has_adapters(path):
+        original = brief(_openvla().named_base(path))
         raise UserError(
-            f"{path} holds adapters apart from what they were trained on ({brief(named_base(path))}): name it, "
-            "load_weights(policy, run, base=…), or python -m mme_vla.weights.convert <run> <new folder> --base …"
+            f"{path} holds adapters apart from what they were trained on ({original}): name it, "
+            "load_weights(policy, run, base=…), or mme-vla weights <run> <new folder> --base …"
         )
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
@@ -198,8 +229,8 @@ def open_source(
 
 
 def _of_archive(file: Path) -> Source:
-    found = open_archive(file)
-    return Source("released", found.folder, params=found.params)
+    archive = open_archive(file)
+    return Source("released", archive.folder, params=archive.params)
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
@@ -211,7 +242,7 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
     if any(name.startswith("backbone.") for name in names) or "backbone" in Source("ours", folder).config:
         return Source("ours", folder, files)
-    if is_openvla(names):
+    if METHOD_FORMATS["openvla"].function("matches")(names):
         return Source("openvla", folder, files)
     if any(name.startswith("PaliGemma/") for name in names):
         return Source("released", folder, files)
@@ -223,22 +254,19 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
 
 def _of_torch_file(path: Path) -> Source:
     names = list(read_torch_file(path))
-    for name, of in OWN_NAMES.items():
-        if of.matches(names):
+    for name in NATIVE_FORMATS:
+        if METHOD_FORMATS[name].function("matches")(names):
             return Source(name, path.parent, (path,))
     few = listed(sorted(names), 3)
-    raise UserError(f"{path} holds no policy known here: its tensors are called {few}. Known: {', '.join(OWN_NAMES)}.")
+    raise UserError(
+        f"{path} holds no policy known here: its tensors are called {few}. Known: {', '.join(NATIVE_FORMATS)}."
+    )
 
 
 def _names(file: Path) -> list[str]:
     """Tensor names in a safetensors file's header."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
     check_header(file)
-    try:
-        with safe_open(file, "pt") as opened:
-            return list(opened.keys())
-    except (SafetensorError, OSError) as error:
-        raise UserError(
-            f"{file} is damaged or not a safetensors file: {brief(str(error), 300, quote=False)}"
-        ) from error
+    with decoding(file, "a safetensors file", "Download or copy it again."), safe_open(file, "pt") as opened:
+        return list(opened.keys())

@@ -1,12 +1,13 @@
 """Checkpoints that `torch.save` wrote, read without running anything in them."""
 
-import pickle
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, listed
+from mme_vla.utils import decoding, require_file
 
 SUFFIXES = (".pth", ".pt")
 MODEL = ("model", "state_dict", "model_state_dict", "model_state")
@@ -18,26 +19,30 @@ def find_torch_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file())
 
 
-def read_torch_file(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name (of tables by part: part and name), memory-mapped where its layout allows.
+_REMEDY = "It is damaged, or holds objects, which are code and are not run. Download or copy it again."
 
-    Raises:
-        UserError: the file is damaged, holds more than tensors and plain values, or no table of tensors.
+
+def load_torch_file(path: Path, what: str) -> Any:
+    """Read a file that `torch.save` wrote, tensors on the CPU. Objects in it are code, and are not run.
+
+    Args:
+        what: the file is, for the message.
     """
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
-        raise UserError(
-            f"{path} cannot be read as weights alone ({brief(str(error).splitlines()[0], 200, quote=False)}): it is "
-            "damaged, or holds objects, which are code and are not run."
-        ) from error
+    require_file(path, what)  # torch would wait for a pipe without end
+    with decoding(path, what, _REMEDY):
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def read_torch_file(path: Path) -> dict[str, Tensor]:
+    """The tensors of a file, by name (of tables by part: part and name)."""
+    content = load_torch_file(path, "weights")
     for key in MODEL:
-        if isinstance(found, dict) and isinstance(found.get(key), dict):
-            found = found[key]
+        if isinstance(content, dict) and isinstance(content.get(key), dict):
+            content = content[key]
             break
-    if isinstance(found, dict) and found and all(isinstance(part, dict) for part in found.values()):
-        found = {f"{part}.{name}": tensor for part, own in found.items() for name, tensor in own.items()}
-    if not isinstance(found, dict) or not found or not all(isinstance(value, Tensor) for value in found.values()):
-        held = listed(found) if isinstance(found, dict) else type(found).__name__
-        raise UserError(f"{path} holds no table of tensors, but {held}.")
-    return {str(name): tensor for name, tensor in found.items()}
+    if isinstance(content, dict) and content and all(isinstance(part, dict) for part in content.values()):
+        content = {f"{part}.{name}": tensor for part, tensors in content.items() for name, tensor in tensors.items()}
+    if not isinstance(content, dict) or not content or not all(isinstance(value, Tensor) for value in content.values()):
+        description = listed(content) if isinstance(content, dict) else type(content).__name__
+        raise UserError(f"{path} holds no table of tensors, but {description}.")
+    return {str(name): tensor for name, tensor in content.items()}

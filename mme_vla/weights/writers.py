@@ -9,50 +9,108 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 from mme_vla.policy.base import Policy
-from mme_vla.policy.mme import mme_of
+from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
-from mme_vla.processing.normalisers import NormStats
-from mme_vla.processing.processor import STATS_FILE
-from mme_vla.weights.diffusion_policy import diffusion_adapter, write_diffusion_policy
-from mme_vla.weights.lerobot_pipelines import write_pipelines
-from mme_vla.weights.memoryvla import memoryvla_adapter, write_memoryvla
+from mme_vla.processing.base import DEFAULT
+from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.processing.processor import STATS_FILE, Processor
+from mme_vla.processing.prompt import PROMPTS, GoalPrompt
+from mme_vla.processing.tokenizer import HUB
+from mme_vla.registry import PROCESSORS
 from mme_vla.weights.names.torch_backbone import EMBEDDING
-from mme_vla.weights.openvla import openvla_adapter, write_openvla
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
-from mme_vla.weights.sam2act_files import sam2act_adapter, write_sam2act
-from mme_vla.weights.source import VARIANTS
+from mme_vla.weights.source import METHOD_FORMATS, VARIANTS
+
+BEFORE, AFTER = "policy_preprocessor", "policy_postprocessor"
+_QUANTILES = {"VISUAL": "IDENTITY", "STATE": "QUANTILES", "ACTION": "QUANTILES"}
+
+
+def write_pipelines(policy: MMEPolicy, folder: Path, about: dict[str, Any], stats: NormStats | None) -> str | None:
+    """Write both pipelines and their statistics, if LeRobot's steps can do what this policy's processor does.
+
+    Args:
+        about: LeRobot's `config.json`, whose features and relative actions they follow.
+
+    Returns:
+        None, or in words why there are none.
+    """
+    words = policy.config.get("processor") or {}
+    tokenizer = str(words.get("tokenizer", ""))
+    if stats is None:
+        return "there are no normalisation statistics"
+    if (
+        PROCESSORS[words.get("name", DEFAULT)] is not Processor
+        or PROMPTS[words.get("prompt", "plain")] is not GoalPrompt
+    ):
+        return "LeRobot has no step that writes this policy's prompt"
+    if not tokenizer.startswith(HUB):
+        return f"its tokenizer ({brief(tokenizer)}) is none that LeRobot could fetch from the hub"
+    inputs, outputs = about["input_features"], about["output_features"]
+    relative = {
+        "enabled": about["use_relative_actions"],
+        "exclude_joints": about["relative_exclude_joints"],
+        "action_names": list(policy.embodiment.action.names),
+    }
+    reading = {
+        "tokenizer_name": "/".join(tokenizer.removeprefix(HUB).split("/")[:2]), "max_length": words["prompt_length"],
+        "task_key": "task", "padding_side": "right", "padding": "max_length", "truncation": True,
+    }  # fmt: skip
+    _write(folder, BEFORE, [
+        ("rename_observations_processor", {"rename_map": {}}),
+        ("to_batch_processor", {}),
+        ("relative_actions_processor", relative),
+        ("normalizer_processor", {"eps": 1e-8, "features": inputs | outputs, "norm_map": _QUANTILES}),
+        ("pi0_new_line_processor", {}),
+        ("tokenizer_processor", reading),
+        ("device_processor", {"device": "cpu", "float_dtype": None}),
+    ], stats)  # fmt: skip
+    _write(folder, AFTER, [
+        ("unnormalizer_processor", {"eps": 1e-8, "features": outputs, "norm_map": _QUANTILES}),
+        ("absolute_actions_processor", {"enabled": about["use_relative_actions"]}),
+        ("device_processor", {"device": "cpu", "float_dtype": None}),
+    ], stats)  # fmt: skip
+    return None
+
+
+def _write(folder: Path, name: str, steps: list[tuple[str, dict[str, Any]]], stats: NormStats) -> None:
+    from safetensors.torch import save_file
+
+    described: list[dict[str, Any]] = []
+    for i, (step, config) in enumerate(steps):
+        described.append({"registry_name": step, "config": config})
+        if "norm_map" in config:
+            file = f"{name}_step_{i}_{step}.safetensors"
+            save_file(_tensors(stats), folder / file)
+            described[-1]["state_file"] = file
+    (folder / f"{name}.json").write_text(json.dumps({"name": name, "steps": described}, indent=2) + "\n")
+
+
+def _tensors(stats: NormStats) -> dict[str, torch.Tensor]:
+    def named(feature: str, of: QuantileStats) -> dict[str, torch.Tensor]:
+        return {f"{feature}.{key}": torch.tensor(value, dtype=torch.float32) for key, value in of.to_dict().items()}
+
+    return named("observation.state", stats.state) | named("action", stats.actions)
+
 
 ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
 _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 
 
-_OF_ONE_METHOD = {
-    "sam2act_plus": sam2act_adapter,
-    "diffusion_policy": diffusion_adapter,
-    "openvla": openvla_adapter,
-    "memoryvla": memoryvla_adapter,
-}
-
-
 def check_target(policy: Policy, fmt: str) -> None:
-    """Refuse a format that has no place for this policy, before anything is read.
-
-    Raises:
-        UserError: a memory in a format of memoryless policies, or one without released names.
-    """
+    """Refuse a format that has no place for this policy, before anything is read."""
     if fmt in ("lerobot", "openpi") and policy.memory is not None:
         raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
-    if fmt in _OF_ONE_METHOD:
-        _OF_ONE_METHOD[fmt](policy)
+    if fmt in METHOD_FORMATS:
+        METHOD_FORMATS[fmt].function("adapter")(policy)
 
 
-def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_native(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """`save_pretrained`; the processor carries the statistics."""
     policy.save_pretrained(folder, dtype=_name(dtype))
 
@@ -109,7 +167,7 @@ def write_openpi(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormSt
 def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
     policy = mme_of(policy, "The released layout")
-    names = {ours: theirs for theirs, ours in VARIANTS.items()}
+    names = {target: released for released, target in VARIANTS.items()}
     variant = names.get(str(policy.config.get("name")))
     if policy.memory is not None and variant is not None:
         (folder / "history_config.txt").write_text(f"{variant}.yaml\n")
@@ -117,28 +175,30 @@ def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: Norm
     _write_assets(folder / "0", stats)
 
 
-WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]] = {
-    "ours": write_ours,
+_WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]] = {
+    "ours": write_native,
     "lerobot": write_lerobot,
     "openpi": write_openpi,
     "released": write_released,
-    "diffusion_policy": write_diffusion_policy,
-    "sam2act_plus": write_sam2act,
-    "openvla": write_openvla,
-    "memoryvla": write_memoryvla,
 }
+
+
+def write_policy(policy: Policy, folder: Path, fmt: str, dtype: torch.dtype, stats: NormStats | None) -> None:
+    """Write a policy into `folder` in a format of `FORMATS`."""
+    writer = _WRITERS[fmt] if fmt in _WRITERS else METHOD_FORMATS[fmt].function("write")
+    writer(policy, folder, dtype, stats)
 
 
 def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch.dtype) -> None:
     """Write one file, as those libraries read it; a tensor under two names is written twice."""
     from safetensors.torch import save_file
 
-    seen: set[int] = set()
+    storages: set[int] = set()
     apart = {}
     for name, tensor in tensors.items():
         tensor = cast(tensor.detach(), dtype).cpu()
-        apart[name] = tensor.clone() if tensor.data_ptr() in seen else tensor
-        seen.add(tensor.data_ptr())
+        apart[name] = tensor.clone() if tensor.data_ptr() in storages else tensor
+        storages.add(tensor.data_ptr())
     save_file(apart, folder / WEIGHTS, metadata={"format": "pt"})
 
 

@@ -7,11 +7,11 @@ from typing import Any
 
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.files import read_json
+from mme_vla.utils import read_json
 
 
 def goal_of(spec: EpisodeSpec) -> str:
-    """The goal of an episode as policies are told it; its scene is built for that, without pictures."""
+    """The goal of an episode as policies are told it; its scene is built for that, without images."""
     env = make_task(spec.task, render=False, seed=spec.seed, difficulty=spec.difficulty)
     try:
         goal: str = env.goals()[0].lower()
@@ -22,19 +22,19 @@ def goal_of(spec: EpisodeSpec) -> str:
 
 def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, set[str]]:
     """The goals of a recording, by task: out of its dataset, or of its official files where there is none."""
-    found: dict[str, set[str]] = {}
+    goals: dict[str, set[str]] = {}
     if dataset is not None:
-        from mme_vla.data.conversion import SIDE_FILE
+        from mme_vla.data.convert import SIDE_FILE
 
         for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")["episodes"]:
-            found.setdefault(episode["task"], set()).add(episode["goals"][0])
-        return found
+            goals.setdefault(episode["task"], set()).add(episode["goals"][0])
+        return goals
     from mme_vla.data.hdf5 import list_episodes, open_episode
 
     for ref in list_episodes(official):
         with open_episode(ref) as opened:
-            found.setdefault(ref.task, set()).add(opened.goals[0])
-    return found
+            goals.setdefault(ref.task, set()).add(opened.goals[0])
+    return goals
 
 
 @dataclass
@@ -47,7 +47,7 @@ class TaskCoverage:
 
     @property
     def missing_episodes(self) -> int:
-        """How many episodes ask for what was never shown."""
+        """How many episodes have a goal that was never demonstrated."""
         return sum(map(len, self.missing.values()))
 
     def to_dict(self) -> dict[str, Any]:
@@ -56,23 +56,23 @@ class TaskCoverage:
         return {**counts, "episodes_covered": self.episodes - self.missing_episodes, "missing": self.missing}
 
 
-def compare(recorded: Mapping[str, set[str]], asked: Iterable[tuple[EpisodeSpec, str]]) -> dict[str, TaskCoverage]:
-    """Which of the goals that episodes ask for were recorded, by task.
+def compare(recorded: Mapping[str, set[str]], requested: Iterable[tuple[EpisodeSpec, str]]) -> dict[str, TaskCoverage]:
+    """Which of the goals of episodes were recorded, by task.
 
     Args:
-        recorded: goals by task. asked: episodes with their goals.
+        recorded: goals by task. requested: episodes with their goals.
     """
-    found: dict[str, TaskCoverage] = {}
-    seen: dict[str, set[str]] = {}
-    for spec, goal in asked:
-        task = found.setdefault(spec.task, TaskCoverage())
+    coverage: dict[str, TaskCoverage] = {}
+    known_goals: dict[str, set[str]] = {}
+    for spec, goal in requested:
+        task = coverage.setdefault(spec.task, TaskCoverage())
         task.episodes += 1
         if goal not in recorded.get(spec.task, set()):
             task.missing.setdefault(goal, []).append(spec.episode)
-        if goal not in seen.setdefault(spec.task, set()):
-            seen[spec.task].add(goal)
+        if goal not in known_goals.setdefault(spec.task, set()):
+            known_goals[spec.task].add(goal)
             task.goals += 1
-    return found
+    return coverage
 
 
 def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:

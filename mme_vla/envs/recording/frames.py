@@ -1,4 +1,4 @@
-"""Which frames of a demonstration are drawn: those at which something is decided, and those a memory then reads."""
+"""Which frames of a demonstration are rendered: those of decisions, and those that a memory reads there."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.choice_rows import CHOICE_NUMBERS, find_choices, row_of
-from mme_vla.data.waypoints import Motions, find_motions, known_poses
+from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_motions, known_poses, row_of
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.episodes import spans
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError
+from mme_vla.memory.base import past_view_spec
 from mme_vla.registry import MEMORIES
 
 if TYPE_CHECKING:
@@ -26,18 +26,15 @@ _SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """A list of frames that every demonstration is drawn at; all other steps have no pictures.
+    """The rendered frames of every demonstration; all other steps have no images.
 
     at: the frames that both cameras show. `decisions`: the last frame before each planned motion of the execution,
         where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
         among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
         episode's first stored frame.
-    memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames, and
-        so does the other where the memory gives a backbone past views.
-    every: of the decisions, every so many, for a policy that executes so many motions before it is asked again.
-
-    Raises:
-        UserError: `at` is none of these.
+    memory: a section of a memory; the front camera also shows what this memory may read at those frames, and so does
+        the other where the memory gives a backbone past views.
+    every: stride over the decisions, for a policy that executes several motions of a chunk.
     """
 
     at: str | int | Sequence[int | str]
@@ -52,43 +49,43 @@ class FrameChoice:
         if self.memory is not None:
             _build(self.memory)
 
-    def beforehand(self) -> Drawing | None:
-        """What is drawn, where no demonstration has to be seen for it: numbers that no memory adds to; else None."""
+    def beforehand(self) -> RenderRequest | None:
+        """The request, where it does not depend on the demonstration: numbers without a memory; else None."""
         if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
             return None
         numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
-        return Drawing(dict.fromkeys(CAMERAS, numbers), now=())
+        return RenderRequest(dict.fromkeys(CAMERAS, numbers), now=())
 
-    def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
-        """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
+    def render_request(self, steps: Sequence["RecordedStep"]) -> RenderRequest:
+        """The request for a demonstration whose steps are known from a recording without images."""
         video = _video(steps)
-        shown = self._shown(steps, video)
-        frames = {camera: frozenset(shown) for camera in CAMERAS}
+        numbers = self._frame_numbers(steps, video)
+        frames = {camera: frozenset(numbers) for camera in CAMERAS}
         if self.memory is not None:
-            read = self.read(np.array(shown, np.int64), video)
-            for camera in CAMERAS if _build(self.memory).looks_back is not None else (MEMORY_CAMERA,):
+            read = self.read(np.array(numbers, np.int64), video)
+            for camera in CAMERAS if past_view_spec(_build(self.memory)) is not None else (MEMORY_CAMERA,):
                 frames[camera] |= read
-        return Drawing(frames, now=())
+        return RenderRequest(frames, now=())
 
-    def read(self, shown: np.ndarray, exec_start: int) -> frozenset[int]:
-        """What the memory may read when it is asked at these frames [n], the execution beginning at `exec_start`."""
+    def read(self, frames: np.ndarray, exec_start: int) -> frozenset[int]:
+        """What the memory may read at these frames [n]; the execution begins at `exec_start`."""
         if self.memory is None:
             return frozenset()
-        return frozenset(_build(self.memory).frames_read(shown, exec_start).tolist())
+        return frozenset(_build(self.memory).frames_read(frames, exec_start).tolist())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
         return {"at": self.at if isinstance(self.at, str | int) else list(self.at), "memory": self.memory}
 
-    def _shown(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
+    def _frame_numbers(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
         if isinstance(self.at, int):
             return list(range(video, len(steps), self.at))
         if self.at == DECISIONS:
-            found: list[int] = motions_of(steps).decisions[:: self.every].tolist()
-            return found
+            decisions: list[int] = motions_of(steps).decisions[:: self.every].tolist()
+            return decisions
         if self.at == CHOICES:
-            chosen: list[int] = choices_of(steps).decisions.tolist()
-            return chosen
+            choices: list[int] = choices_of(steps).decisions.tolist()
+            return choices
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
 
 

@@ -1,20 +1,18 @@
-"""One demonstration as data: every stored step of an episode, with the fields of the official files."""
+"""Demonstrates a task and records every stored step, with the fields of the official files."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding, project
-from mme_vla.envs.observations import AngleTrack, Include, Observer
-from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.observations import AngleTrack, Include, Observer, RenderRequest
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
-from mme_vla.envs.robot.grasping import DOWNWARD_Q
+from mme_vla.envs.robot.gripper_skills import DOWNWARD_Q
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
 if TYPE_CHECKING:
@@ -22,6 +20,44 @@ if TYPE_CHECKING:
 
     from mme_vla.envs.subtasks import SubTask
     from mme_vla.envs.task import Task
+
+
+def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
+    """Perform the sub-tasks of a task that has just been reset, with `env.recording` set; whether it succeeded.
+
+    The task is evaluated before and after each sub-task; `env.progress.planned` moves at these evaluations only. In a
+    recovery demonstration the sampled pick of the execution fails once first.
+
+    Args:
+        subtasks: by default all of the task's.
+
+    Raises:
+        PlanningError: a motion could not be planned.
+    """
+    subtasks = env.progress.subtasks if subtasks is None else subtasks
+    picks = [subtask for subtask in subtasks if subtask.pick and not subtask.video]
+    recording, env.recording = env.recording, True
+    try:
+        ended = _ended(env)
+        for subtask in subtasks:
+            if ended or _ended(env):
+                break
+            if env.recovery and env.failed_pick is not None and subtask in picks:
+                failing = picks.index(subtask) == env.failed_pick
+                demonstrator.fail_next_pick = env.recovery if failing else None
+            subtask.run(demonstrator)
+            ended = _ended(env)
+    finally:
+        env.recording = recording
+    return env.success() and not env.progress.failed
+
+
+def _ended(env: "Task") -> bool:
+    """Evaluate once; whether the episode is over."""
+    env.evaluate()
+    env.progress.planned = env.progress.index
+    return env.progress.succeeded or env.progress.failed
+
 
 MAX_STEPS = 2000
 """Control steps after which a recording is given up."""
@@ -36,10 +72,7 @@ class TooLongError(RuntimeError):
 
 @dataclass(frozen=True)
 class RecordedStep:
-    """One stored time step; the observation was taken after the action.
-
-    obs: keys of the official files' `obs`. action: likewise. info: likewise.
-    """
+    """One stored time step with the keys of the official files; the observation was made after the action."""
 
     obs: dict[str, Any]
     action: dict[str, Any]
@@ -48,7 +81,7 @@ class RecordedStep:
 
 @dataclass
 class Recording:
-    """What became of one demonstration."""
+    """The result of one demonstration."""
 
     success: bool
     steps: int
@@ -57,21 +90,19 @@ class Recording:
     video: int = 0
     """Stored steps of the conditioning video."""
     error: str | None = None
-    """Why the demonstration broke off, if it did."""
+    """Why the demonstration ended early, if it did."""
     frames: list[RecordedStep] = field(default_factory=list)
     """Empty where a callback took the steps."""
 
 
 class Recorder:
-    """Demonstrates a task and takes down every step that is worth storing.
-
-    Steps during which the demonstrator is at a sub-task without words (`NO_RECORD`) are not stored.
+    """Demonstrates a task and records its steps, except those of sub-tasks without a text (`NO_RECORD`).
 
     Args:
         task: created with the observation mode `none`.
-        render: take pictures; without them frames hold states, actions and plain texts only.
-        drawing: which stored steps are drawn, counted from 0, by which cameras; `obs` of the others has no pictures.
-            By default all. Where a text needs a pixel, the front camera looks all the same.
+        render: take images; without them frames hold states, actions and plain texts only.
+        render_request: which stored steps, counted from 0, are rendered by which cameras; by default all. Where a text
+            needs a pixel, the front camera renders in any case.
         on_step: takes each stored step; by default they are collected in `Recording.frames`.
     """
 
@@ -80,12 +111,12 @@ class Recorder:
         task: "Task",
         render: bool = True,
         on_step: Callable[[RecordedStep], None] | None = None,
-        drawing: Drawing | None = None,
+        render_request: RenderRequest | None = None,
     ) -> None:
-        self._task, self._render, self._on_step, self._drawing = task, render, on_step, drawing
-        pictures = {"include_front_depth": render, "include_wrist_depth": render}
+        self._task, self._render, self._on_step, self._render_request = task, render, on_step, render_request
+        depth = {"include_front_depth": render, "include_wrist_depth": render}
         poses = {"include_front_camera_extrinsic": True, "include_wrist_camera_extrinsic": True}
-        self._observer = Observer(task, Include.from_options(pictures | poses), render)
+        self._observer = Observer(task, Include.from_options(depth | poses), render)
 
     def record(self) -> Recording:
         """Reset the task and demonstrate it once."""
@@ -99,16 +130,16 @@ class Recorder:
         self._waypoint: np.ndarray | None = None
         self._in_video: bool | None = None
         self._last_stored: str | int | None = None
-        self._shown = task.progress.shown
+        self._displayed = task.progress.displayed
         self._result = Recording(success=False, steps=0)
         self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
-        task.observe = self._observe
+        task.on_frame = self._on_frame
         try:
             self._result.success = demonstrate(task, self._demonstrator)
         except (PlanningError, TooLongError) as error:
             self._result.error = str(error) or type(error).__name__
         finally:
-            task.observe = None
+            task.on_frame = None
         return self._result
 
     def _step(self, action: np.ndarray) -> None:
@@ -121,23 +152,23 @@ class Recorder:
     def _note_waypoint(self, pose: "sapien.Pose", gripper: float) -> None:
         self._enter_phase()
         angles = AngleTrack().follow(pose.q)
-        # Straight down is a half turn either way: which one would be a matter of rounding.
+        # Straight down is half a turn either way, which rounding would decide.
         if np.array_equal(pose.q, DOWNWARD_Q):  # as over buttons
             angles[0] = -np.pi
         else:
             angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
         self._waypoint = np.concatenate([pose.p, angles, [gripper]]).astype(np.float64)
 
-    def _observe(self, evaluated: dict[str, Any]) -> None:
+    def _on_frame(self, evaluated: dict[str, Any]) -> None:
         self._observer.follow()
         progress = self._task.progress
         # The text was set before the evaluation moved the pointer: it follows one step later.
-        shown, self._shown = self._shown, progress.shown
+        displayed, self._displayed = self._displayed, progress.displayed
         planned = progress.demonstrated
         self._enter_phase()
         if planned.text == NO_RECORD:
             return
-        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, shown))
+        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, displayed))
         self._result.stored += 1
         self._result.video += planned.video
         if self._on_step is None:
@@ -146,15 +177,15 @@ class Recorder:
             self._on_step(step)
 
     def _enter_phase(self) -> None:
-        """Forget the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
+        """Drop the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
         video = self._task.progress.demonstrated.video
         if self._in_video is not None and video != self._in_video:
             self._waypoint = None
         self._in_video = video
 
     def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
-        number, drawing = self._result.stored, self._drawing
-        cameras = CAMERAS if drawing is None else drawing.cameras(number, newest=False)
+        number, request = self._result.stored, self._render_request
+        cameras = CAMERAS if request is None else request.cameras(number, newest=False)
         frame = self._observer.frame(evaluated, cameras)
         frame = {name: value for name, value in frame.items() if value is not None}
         closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
@@ -168,25 +199,25 @@ class Recorder:
         if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
-        shown = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
+        pixel = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
         return {
             "joint_action": np.append(action[:ARM_JOINTS], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
             "waypoint_action": np.full(len(POSE) + 1, np.nan, np.float32) if self._waypoint is None else self._waypoint,
-            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in shown]}),
+            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in pixel]}),
         }
 
-    def _texts(self, planned: "SubTask", shown: "SubTask") -> dict[str, Any]:
+    def _texts(self, planned: "SubTask", displayed: "SubTask") -> dict[str, Any]:
         progress = self._task.progress
         completed = progress.succeeded
-        look = self._observer.segmentation if self._render else None
+        segmentation = self._observer.segmentation if self._render else None
         now = "completed" if completed else progress.planned
         boundary, self._last_stored = now != self._last_stored, now
         return {
             "simple_subgoal": COMPLETED if completed else planned.text,
-            "grounded_subgoal": self._planned.update(planned, look),
-            "simple_subgoal_online": shown.text,
-            "grounded_subgoal_online": self._online.update(shown, look),
+            "grounded_subgoal": self._planned.update(planned, segmentation),
+            "simple_subgoal_online": displayed.text,
+            "grounded_subgoal_online": self._online.update(displayed, segmentation),
             "is_video_demo": planned.video,
             "is_subgoal_boundary": boundary,
             "is_completed": completed,

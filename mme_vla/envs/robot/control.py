@@ -1,6 +1,6 @@
-"""The demonstrator's hands: planned motions, gripper, waiting, and driving back to the start.
+"""The base of the demonstrator: planned motions, gripper, waiting, and the way back to the start.
 
-Every motion is a sequence of joint targets, one a control step, handed to a callable that performs the step.
+Every motion is a sequence of joint targets, one a control step, passed to a callable that performs the step.
 """
 
 import math
@@ -23,7 +23,7 @@ GRIPPER_STEPS = 6
 """Control steps that opening or closing takes."""
 FREE_TRIES = 3
 LONG_DETOUR = 200
-"""Steps from which on a sampled motion is thought too long, and tried again."""
+"""Steps above which a sampled motion is planned again."""
 HOME = (0.0, 0.0, 0.2)
 LIMITS = {False: (0.9, 0.9), True: (0.3, 0.9)}
 """Joint velocity and acceleration limits, rad/s and rad/s², of the gripper robot and of the stick robot (`stick`)."""
@@ -39,7 +39,7 @@ class RobotControl:
     Args:
         env: the task, after its reset.
         step: performs one control step with joint targets and gripper [8], or joint targets [7] for the stick.
-        on_waypoint: told a pose of the tool and the gripper command meant for it, before the motion there begins.
+        on_waypoint: called with a pose of the tool and its gripper command before the motion there begins.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class RobotControl:
         self.left = 0
         """Steps that are known to follow the present one: those left of a motion or a grip, and `and_then`."""
         self.and_then = 0
-        """Steps that follow the motion under way, where who asked for it knows of any."""
+        """Steps that the caller will add to the motion under way."""
         self._step = step
         self._on_waypoint = on_waypoint
 
@@ -145,18 +145,20 @@ class RobotControl:
             if plan is not None and len(plan) <= LONG_DETOUR:
                 break
         if plan is None:
-            place, turn = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
-            raise PlanningError(f"No way to {place}, orientation {turn} (wxyz): out of the arm's reach or blocked.")
+            place, orientation = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
+            raise PlanningError(
+                f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or blocked."
+            )
         return plan
 
     def _move_gripper(self, command: float) -> None:
         if self.env.stick:
             return
         self.gripper = command
-        held = self.env.qpos
+        qpos = self.env.qpos
         for done in range(1, GRIPPER_STEPS + 1):
             self.left = GRIPPER_STEPS - done
-            self._command(held)
+            self._command(qpos)
 
     def _command(self, joints: np.ndarray) -> None:
         arm = np.asarray(joints, np.float64)[:ARM_JOINTS]

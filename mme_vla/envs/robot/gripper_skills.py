@@ -1,14 +1,73 @@
-"""What the gripper is shown to do: pick, place, put down, drop, press, hover."""
+"""Primitives of the gripper: pick, place, put down, drop, press, hover; and the orientations they need."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import sapien
+from mani_skill.utils.geometry.trimesh_utils import get_component_mesh
+from sapien import physx
+from scipy.spatial.transform import Rotation
 
 from mme_vla.envs.robot.control import CLOSE, OPEN, RobotControl
-from mme_vla.envs.robot.grasping import DOWNWARD_Q, failing_offset, grasp_orientation, turned
-from mme_vla.envs.scene.objects import Button
+from mme_vla.envs.scene.articulated import Button
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import Thing
+
+DOWN = np.array([0.0, 0.0, -1.0])
+DOWNWARD_Q = (0.0, 1.0, 0.0, 0.0)
+"""The gripper straight down, its x axis along the world's (roll pi); wxyz."""
+SQUARE = 0.01
+"""Two sides whose ratio is within this of 1 are equally good to grasp."""
+
+
+def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
+    """Orientation of the tool for grasping an object from above.
+
+    The fingers close along the shorter of the two horizontal axes of the object's smallest bounding box; where these
+    are equal, along the one nearer to `closing`, their present direction [3]. Returns a quaternion [4], wxyz.
+    """
+    body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
+    box = get_component_mesh(body).bounding_box_oriented.primitive
+    axes, extents = np.array(box.transform)[:3, :3].T, np.array(box.extents)
+    first, second = np.argsort(np.abs(axes @ DOWN))[:2]
+    if extents[second] < extents[first]:
+        first, second = second, first
+    if extents[first] / extents[second] > 1 - SQUARE and abs(closing @ axes[second]) > abs(closing @ axes[first]):
+        first = second
+    across = axes[first] * (1 if closing @ axes[first] >= 0 else -1)
+    across = across - (across @ DOWN) * DOWN
+    return pointing_down(np.cross(across, DOWN))
+
+
+def pointing_down(forward: np.ndarray) -> np.ndarray:
+    """Orientation wxyz of a gripper that points down, its x axis along a horizontal direction [2] or [3]."""
+    x = np.array([forward[0], forward[1], 0.0])
+    x /= np.linalg.norm(x)
+    return wxyz(Rotation.from_matrix(np.stack([x, np.cross(DOWN, x), DOWN], axis=1)))
+
+
+def turned(q: np.ndarray, axis: str, angle: float) -> np.ndarray:
+    """An orientation wxyz turned about one of its own axes by an angle in radians."""
+    return wxyz(Rotation.from_quat(np.roll(q, -1)) * Rotation.from_euler(axis, angle))
+
+
+def wxyz(rotation: Rotation) -> np.ndarray:
+    """A rotation as a quaternion [4], scalar first."""
+    return np.roll(rotation.as_quat(), 1)
+
+
+def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
+    """Offset [3] of a grasp that is to fail, `distance` metres along each axis that is missed.
+
+    `z` closes too high, `xy` beside the object, in a direction that the seed decides.
+    """
+    if mode == "z":
+        return np.array([0.0, 0.0, distance])
+    draws, signs = Draws(seed), (0, 0)
+    while signs == (0, 0):
+        signs = (draws.integer(-1, 2), draws.integer(-1, 2))
+    return distance * np.array([*signs, 0.0])
+
 
 ABOVE, ABOVE_CONTAINER, ABOVE_BOARD = 0.15, 0.2, 0.2
 """Heights of the tool before and after a grasp or a release, metres."""
@@ -38,7 +97,6 @@ class GripperPrimitives(RobotControl):
         """Put what is held on a target, and withdraw.
 
         Args:
-            target: where to.
             z: height of the tool at the release, metres; by default the target's own.
         """
         q = self.env.tcp_pose.q
@@ -71,7 +129,6 @@ class GripperPrimitives(RobotControl):
         """Press a button with closed fingers and let it go.
 
         Args:
-            button: which one.
             hold: first move above it; without, the tool is there already.
             close: close the fingers first; without, they are closed already and time is short.
         """
@@ -95,10 +152,10 @@ class GripperPrimitives(RobotControl):
         if mode is not None:
             self._fail_grasp(thing, above, depth, failing_offset(mode, miss, self.env.seed))
         grasp = self._grasp_pose(thing, depth)
-        rest = thing.position[2]
+        initial_height = thing.position[2]
         self._grasp_at(grasp, thing, above)
-        if self.env.second_tries and thing.position[2] - rest < LIFTED:
-            # A finger was in something's way: once more, across the other sides.
+        if self.env.second_tries and thing.position[2] - initial_height < LIFTED:
+            # A finger was blocked: once more, across the other sides.
             self.open()
             grasp = self._grasp_pose(thing, depth)
             self._grasp_at(sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi / 2)), thing, above)

@@ -1,7 +1,6 @@
-"""Where the tool is for given joint angles, and which joint angles put it somewhere.
+"""Forward and inverse kinematics of the arm.
 
-Poses handed in and out are in the world; the model itself works in the frame of the robot's base. Angles are in
-radians, lengths in metres.
+Poses are in the world unless named otherwise; the model itself works in the base frame. Radians and metres.
 """
 
 from typing import Any
@@ -12,7 +11,7 @@ import sapien
 from mme_vla.embodiment.robomme import ARM_JOINTS
 
 LIMIT_TOLERANCE = 1e-3
-"""How far past a joint limit still counts as within, radians (metres for the fingers)."""
+"""Tolerance of the joint limits, radians (metres for the fingers)."""
 IK_TOLERANCE = 1e-3
 """Largest accepted distance of an inverse-kinematics solution: metres plus the chord of the two quaternions."""
 _RESTARTS = 19
@@ -102,8 +101,8 @@ class Arm:
         return full
 
     def _wrapped(self, arm: np.ndarray) -> np.ndarray:
-        turns = np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
-        return arm - 2 * np.pi * turns
+        revolutions = np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
+        return arm - 2 * np.pi * revolutions
 
 
 def pose_distance(a: sapien.Pose, b: sapien.Pose) -> float:

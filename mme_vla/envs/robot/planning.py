@@ -1,4 +1,4 @@
-"""Motion plans for the arm: a straight screw motion of the tool, and a sampled detour for when that fails.
+"""Motion plans for the arm: a straight screw motion of the tool, and an RRT* path in joint space where that fails.
 
 Both give joint angles to be used as targets, one row a control step. Their timing is the fastest one that keeps every
 joint below a velocity and an acceleration limit, so the number of steps follows from the path.
@@ -13,7 +13,6 @@ from toppra import algorithm, constraint
 
 from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.envs.robot.kinematics import Arm
-from mme_vla.envs.robot.path_search import sample_path
 
 CONTROL_STEP = 0.05
 """Seconds between two rows of a plan: the control period."""
@@ -23,7 +22,7 @@ MOST_STEPS = 200
 """Steps after which a screw motion is given up: at the edge of its reach the arm would swing for ever."""
 _STALLED = 1e-4
 _NO_ROTATION = 3e-5
-_HALF_TURN = 1e-5
+_PI_TOLERANCE = 1e-5
 # The trace of a rotation matrix within these of 3 and of -1: the angle is then below 0.0055, or within 0.0032 of pi.
 
 logging.getLogger("toppra").setLevel(logging.ERROR)
@@ -35,7 +34,6 @@ def plan_screw(
     target_pose: sapien.Pose,
     velocity_limit: float = 0.9,
     acceleration_limit: float = 0.9,
-    dt: float = CONTROL_STEP,
 ) -> np.ndarray | None:
     """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
 
@@ -46,9 +44,7 @@ def plan_screw(
         arm: the kinematic model.
         qpos: present joint angles, [7] or longer.
         target_pose: of the tool centre point in the world.
-        velocity_limit: of every joint, radians per second.
-        acceleration_limit: of every joint, radians per second squared.
-        dt: seconds between two rows.
+        velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
     Returns:
         Joint targets [n, 7], the first being the present angles; None where a joint limit is in the way, the motion
@@ -69,19 +65,19 @@ def plan_screw(
         if length == 0:
             return None
         step *= JOINT_STEP / length
-        moved = jacobian @ step
-        overshoot = np.linalg.norm(moved) / max(np.linalg.norm(remaining), np.finfo(float).tiny)
+        motion = jacobian @ step
+        overshoot = np.linalg.norm(motion) / max(np.linalg.norm(remaining), np.finfo(float).tiny)
         arrived = bool(overshoot > 1)
         if arrived:
-            step, moved = step / overshoot, moved / overshoot
+            step, motion = step / overshoot, motion / overshoot
         joints = joints + step
-        remaining = remaining - moved
-        if np.linalg.norm(moved) < _STALLED or not arm.within_limits(joints):
+        remaining = remaining - motion
+        if np.linalg.norm(motion) < _STALLED or not arm.within_limits(joints):
             return None
         path.append(joints)
         if len(path) > MOST_STEPS:
             return None
-    return time_optimal(np.array(path), velocity_limit, acceleration_limit, dt)
+    return time_optimal(np.array(path), velocity_limit, acceleration_limit)
 
 
 def plan_free(
@@ -90,41 +86,31 @@ def plan_free(
     target_pose: sapien.Pose,
     velocity_limit: float = 0.9,
     acceleration_limit: float = 0.9,
-    dt: float = CONTROL_STEP,
     seed: int = 0,
 ) -> np.ndarray | None:
-    """Move the tool to a pose along whatever joint path sampling finds (RRT*); the fallback of `plan_screw`.
+    """Move the tool to a pose along a joint path found by sampling (RRT*); the fallback of `plan_screw`.
 
     Args:
-        arm: the kinematic model.
-        qpos: present joint angles, [7] or longer.
-        target_pose: of the tool centre point in the world.
-        velocity_limit: of every joint, radians per second.
-        acceleration_limit: of every joint, radians per second squared.
-        dt: seconds between two rows.
-        seed: of the samples.
+        seed: of the samples; the others as in `plan_screw`.
 
     Returns:
-        Joint targets [n, 7], the first being the present angles; None where the pose is out of reach or no path was
-        found.
+        Joint targets [n, 7], the first being the present angles; None where the pose is out of reach or no path exists.
     """
     start = np.asarray(qpos, np.float64)[:ARM_JOINTS]
     goal = arm.ik(target_pose, start)
     path = None if goal is None else sample_path(arm, start, goal, seed)
-    return None if path is None else time_optimal(path, velocity_limit, acceleration_limit, dt)
+    return None if path is None else time_optimal(path, velocity_limit, acceleration_limit)
 
 
-def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: float, dt: float) -> np.ndarray | None:
+def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: float) -> np.ndarray | None:
     """The fastest passage through joint waypoints, sampled.
 
     A cubic spline through the waypoints, which are spaced evenly in its parameter, is given constant accelerations
-    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / dt) instants from start to end.
+    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / `CONTROL_STEP`) times.
 
     Args:
         path: joint waypoints [k, 7], k at least 2.
-        velocity_limit: of every joint, radians per second.
-        acceleration_limit: of every joint, radians per second squared.
-        dt: seconds.
+        velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
     Returns:
         Joint targets [n, 7], or None where no passage within the limits exists.
@@ -138,7 +124,7 @@ def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: fl
     passage = algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel").compute_trajectory()
     if passage is None:
         return None
-    return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / dt))))
+    return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / CONTROL_STEP))))
 
 
 def twist_of(transform: np.ndarray) -> np.ndarray | None:
@@ -147,7 +133,7 @@ def twist_of(transform: np.ndarray) -> np.ndarray | None:
     trace = np.trace(rotation)
     if abs(trace - 3) <= _NO_ROTATION:
         return np.concatenate([translation, np.zeros(3)])
-    if abs(trace + 1) <= _HALF_TURN:
+    if abs(trace + 1) <= _PI_TOLERANCE:
         return None
     angle = np.arccos((trace - 1) / 2)
     axis = np.array(
@@ -158,3 +144,131 @@ def twist_of(transform: np.ndarray) -> np.ndarray | None:
     # Inverse of the left Jacobian of SO(3): from the displacement's translation to the twist's linear part.
     linear = np.eye(3) - angle / 2 * cross + (1 - angle / 2 / np.tan(angle / 2)) * cross @ cross
     return np.concatenate([linear @ translation, angle * axis])
+
+
+RESOLUTION = 0.05
+"""Joint distance between two configurations that are checked on an edge, radians."""
+REACH = 0.5
+"""Longest edge that the tree grows, radians."""
+GOAL_BIAS = 0.2
+ROUNDS = 1500
+"""Samples in one attempt; a number, not a time, so that the same seed gives the same path."""
+WRIST_CLEARANCE = 0.03
+COLUMN_RADIUS, COLUMN_HEIGHT = 0.15, 0.45
+"""The robot's base and shoulder as a cylinder that the hand keeps out of, metres."""
+
+
+class Obstacles:
+    """Whether the arm is clear of the table and of the robot's own column.
+
+    The tool may go as low as in `ends`, the start and goal configurations [7].
+    """
+
+    def __init__(self, arm: Arm, ends: list[np.ndarray]) -> None:
+        self._arm = arm
+        self._floor = min([0.0, *(arm.forward_in_base(end).p[2] + arm.base.p[2] for end in ends)]) - 1e-3
+
+    def clear(self, joints: np.ndarray) -> bool:
+        """Whether one configuration [7] is free."""
+        tool, wrist = self._arm.forward_in_base(joints), self._arm.wrist_in_base()
+        height = self._arm.base.p[2]
+        in_column = any(np.linalg.norm(p[:2]) < COLUMN_RADIUS and p[2] < COLUMN_HEIGHT for p in (tool.p, wrist.p))
+        return bool(tool.p[2] + height >= self._floor and wrist.p[2] + height >= WRIST_CLEARANCE) and not in_column
+
+    def clear_between(self, a: np.ndarray, b: np.ndarray) -> bool:
+        """Whether the straight joint path between two configurations is free, the first one not examined."""
+        steps = max(1, int(np.ceil(np.linalg.norm(b - a) / RESOLUTION)))
+        return all(self.clear(a + (b - a) * i / steps) for i in range(1, steps + 1))
+
+
+def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.ndarray | None:
+    """Joint waypoints [k, 7] from start to goal: the straight line if it is free, else what RRT* finds.
+
+    Karaman and Frazzoli 2011: each node of a random tree is connected to the cheapest free neighbour, and
+    reconnected where a newer node offers a shorter way.
+
+    Args:
+        start, goal: joint angles [7]. seed: of the samples.
+
+    Returns:
+        The path, or None after `ROUNDS` samples.
+    """
+    obstacles = Obstacles(arm, [start, goal])
+    if obstacles.clear_between(start, goal):
+        return np.array([start, goal])
+    random = np.random.default_rng(seed)
+    tree = _Tree(start, obstacles)
+    for _ in range(ROUNDS):
+        sample = goal if random.random() < GOAL_BIAS else random.uniform(arm.lower, arm.upper)
+        tree.grow(sample)
+    path = tree.path_to(goal)
+    return None if path is None else np.array(_shortened(path, obstacles))
+
+
+def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]:
+    """Leave out what a straight line can skip, then space the rest evenly, so that a spline stays near it."""
+    points, i = [path[0]], 0
+    while i < len(path) - 1:
+        free = (j for j in range(len(path) - 1, i + 1, -1) if obstacles.clear_between(path[i], path[j]))
+        j = next(free, i + 1)
+        steps = int(np.ceil(np.linalg.norm(path[j] - path[i]) / REACH))
+        points += [path[i] + (path[j] - path[i]) * k / steps for k in range(1, steps)] + [path[j]]
+        i = j
+    return points
+
+
+class _Tree:
+    def __init__(self, root: np.ndarray, obstacles: Obstacles) -> None:
+        self.nodes, self.parents, self.costs = [root], [-1], [0.0]
+        self._obstacles = obstacles
+
+    def grow(self, sample: np.ndarray) -> None:
+        """Add a node on the way from the nearest one to the sample, if that way is free."""
+        distances = self._distances(sample)
+        nearest = int(np.argmin(distances))
+        if distances[nearest] == 0:
+            return
+        way = sample - self.nodes[nearest]
+        node = self.nodes[nearest] + way * min(1.0, REACH / distances[nearest])
+        if not self._obstacles.clear_between(self.nodes[nearest], node):
+            return
+        near = [i for i in np.flatnonzero(self._distances(node) <= REACH) if i != nearest]
+        parent, cost = nearest, self._cost_via(nearest, node)
+        for i in near:
+            if self._cost_via(i, node) < cost and self._obstacles.clear_between(self.nodes[i], node):
+                parent, cost = int(i), self._cost_via(i, node)
+        self.nodes.append(node)
+        self.parents.append(parent)
+        self.costs.append(cost)
+        self._rewire(near)
+
+    def path_to(self, goal: np.ndarray) -> list[np.ndarray] | None:
+        """The way from the root to a node that is the goal."""
+        distances = self._distances(goal)
+        node = int(np.argmin(distances))
+        if distances[node] > 1e-9:
+            return None
+        path = []
+        while node >= 0:
+            path.append(self.nodes[node])
+            node = self.parents[node]
+        return path[::-1]
+
+    def _rewire(self, near: list[int]) -> None:
+        new = len(self.nodes) - 1
+        for i in near:
+            cost = self._cost_via(new, self.nodes[i])
+            if cost < self.costs[i] and self._obstacles.clear_between(self.nodes[new], self.nodes[i]):
+                self._lower(i, self.costs[i] - cost)
+                self.parents[i] = new
+
+    def _lower(self, node: int, gain: float) -> None:
+        self.costs[node] -= gain
+        for child in [i for i, parent in enumerate(self.parents) if parent == node]:
+            self._lower(child, gain)
+
+    def _cost_via(self, parent: int, node: np.ndarray) -> float:
+        return self.costs[parent] + float(np.linalg.norm(node - self.nodes[parent]))
+
+    def _distances(self, sample: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(np.array(self.nodes) - sample, axis=1)

@@ -1,13 +1,11 @@
 """The two robots of the benchmark: a Panda with a gripper and a Panda with a stick, both with a camera on the hand.
 
 The stock simulator describes both; here the wrist camera gets the benchmark's size, and the stick robot, which has no
-camera in stock, gets the mount of the gripper robot. Robots are also described without anything to look at, so that
+camera in stock, gets the mount of the gripper robot. Robots are also described without visual shapes, so that
 physics can run where there is no renderer, and the wrist camera's own body with no more detail than shows.
 """
 
 import hashlib
-import os
-import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,8 +18,7 @@ from mani_skill.agents.robots.panda.panda_stick import PandaStick
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 from mani_skill.sensors.camera import CameraConfig
 
-from mme_vla.envs.meshes import CELL, coarsen, read_stl, stl_bytes
-from mme_vla.files import user_cache
+from mme_vla.utils import user_cache, write_atomically
 
 WRISTCAM = "mme_vla_panda_wristcam"
 """Agent id of the Panda with gripper and wrist camera."""
@@ -34,6 +31,10 @@ CAMERA_LINK = "camera_link"
 MOUNT = ("camera_base_link", CAMERA_LINK)
 """The links by which the wrist camera hangs on the hand."""
 _CAMERA_MESH = "d415.stl"
+CELL = 0.001
+"""Width of a cell, metres: less than a pixel covers from 0.13 metres on."""
+_HEADER_BYTES = 80
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def _camera(agent: Any) -> list[CameraConfig]:
@@ -95,7 +96,6 @@ def description(stock: str, mount_from: str | None = None, visible: bool = True)
             mesh.set("filename", str(_coarse(Path(mesh.attrib["filename"]), caches)))
     text = ElementTree.tostring(robot)
     folder = caches / hashlib.sha256(text).hexdigest()[:16]
-    folder.mkdir(parents=True, exist_ok=True)
     _write(folder / source.with_suffix(".srdf").name, source.with_suffix(".srdf").read_bytes())
     _write(folder / source.name, text)
     return str(folder / source.name)
@@ -105,7 +105,7 @@ def _add_mount(robot: ElementTree.Element, donor: ElementTree.Element) -> None:
     joints = [joint for joint in donor.findall("joint") if joint.find("child").attrib["link"] in MOUNT]  # type: ignore[union-attr]
     links = [link for link in donor.findall("link") if link.attrib["name"] in MOUNT]
     for visual in [visual for link in links for visual in link.findall("visual")]:
-        for material in visual.findall("material"):  # the camera is white in the official pictures
+        for material in visual.findall("material"):  # the camera is white in the official images
             visual.remove(material)
     robot.extend([*links, *joints])
 
@@ -115,16 +115,52 @@ def _coarse(mesh: Path, caches: Path) -> Path:
     key = hashlib.sha256(mesh.read_bytes() + str(CELL).encode()).hexdigest()[:16]
     coarse = caches / key / mesh.name
     if not coarse.exists():
-        coarse.parent.mkdir(parents=True, exist_ok=True)
         _write(coarse, stl_bytes(coarsen(read_stl(mesh))))
     return coarse
 
 
 def _write(path: Path, content: bytes) -> None:
-    if path.exists():
-        return
-    # Several processes may write at once: each writes its own file and moves it into place.
-    handle, name = tempfile.mkstemp(dir=path.parent)
-    with os.fdopen(handle, "wb") as file:
-        file.write(content)
-    Path(name).replace(path)
+    if not path.exists():
+        with write_atomically(path) as draft:  # several processes may write at once
+            draft.write_bytes(content)
+
+
+def coarsen(corners: np.ndarray, cell: float = CELL) -> np.ndarray:
+    """Merge corners that lie in one cell of a grid into their mean.
+
+    Args:
+        corners: of each triangle, float [n, 3, 3], metres.
+        cell: width of a cell, metres.
+
+    Returns:
+        Corners [m, 3, 3] float32, m <= n, of the triangles whose corners lie in three cells, each once and with its
+        side kept, in an order that depends on nothing else.
+    """
+    points = corners.reshape(-1, 3)
+    _, cells, counts = np.unique(
+        np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    cells = cells.reshape(-1)
+    means = np.stack([np.bincount(cells, points[:, axis]) for axis in range(3)], 1) / counts[:, None]
+    triangles = cells.reshape(-1, 3)
+    different = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    triangles = triangles[different]
+    # Turned, so that a triangle begins with its lowest corner whichever it began with.
+    rotation = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    triangles = np.unique(np.take_along_axis(triangles, rotation, axis=1), axis=0)
+    return means[triangles].astype(np.float32)
+
+
+def read_stl(path: Path) -> np.ndarray:
+    """Corners [n, 3, 3] float32 of the triangles of a binary STL file."""
+    return np.frombuffer(path.read_bytes(), _TRIANGLE, offset=_HEADER_BYTES + 4)["corners"].copy()
+
+
+def stl_bytes(corners: np.ndarray) -> bytes:
+    """A binary STL file of triangles with corners [n, 3, 3], each with the normal of its side."""
+    triangles = np.zeros(len(corners), _TRIANGLE)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    triangles["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    triangles["corners"] = corners
+    return bytes(_HEADER_BYTES) + len(corners).to_bytes(4, "little") + triangles.tobytes()

@@ -1,23 +1,27 @@
-"""Scripted motions of objects, keyed on the number of steps done: covering, swapping, highlighting, tracing."""
+"""What the script of a task moves: containers, swaps, highlights, marks, traces, and the cue discs of twin scenes.
+
+Motions are functions of the number of control steps done, or of the state of the task.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import sapien
 
-from mme_vla.envs.scene.objects import COLOURS, Disc, build_highlight, build_sphere
+from mme_vla.envs.scene.objects import BELOW_TABLE, COLOURS, RGB, WHITE, Disc, build_highlight, build_sphere
 from mme_vla.envs.scene.things import AWAY, Thing, distance_xy
 
 if TYPE_CHECKING:
-    from mme_vla.envs.task import Task
+    from mme_vla.envs.scene.stage import Stage
+
 
 UNCOVERED_STEPS = 32
 """The first half of the covering window: containers are away and the cubes lie open."""
 COVER_STEPS = 64
 SWAP_STEPS = 50
-BELOW_TABLE = (0.0, 0.0, -10.0)
 
 
 def smoothstep(x: float) -> float:
@@ -104,6 +108,11 @@ class Swap:
             self.partner = min(others, key=lambda thing: distance_xy(thing.position, origin))
 
 
+def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
+    """One swap after another, the first at step `start`; the partner is the nearest object when a swap begins."""
+    return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]
+
+
 def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
     """Linear mixture of two quaternions, normalised."""
     mixed = (1 - alpha) * np.asarray(a) + alpha * np.asarray(b)
@@ -144,7 +153,7 @@ class Highlight:
             self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
 
 
-def build_mark(env: "Task", name: str, radius: float, half_length: float) -> Disc:
+def build_mark(env: "Stage", name: str, radius: float, half_length: float) -> Disc:
     """Red rings that cover a target's own, for `Mark`; metres."""
     return build_highlight(env, name, radius, half_length, COLOURS["red"], rings=True)
 
@@ -161,16 +170,16 @@ class Mark:
     def __init__(self, disc: Thing, place: np.ndarray, steps: int) -> None:
         self._disc, self._place, self._steps = disc, place - [0, 0, Highlight.DEPTH], steps
         self._until = -1
-        self._shown = False
+        self._visible = False
         self._move(BELOW_TABLE)
 
     def update(self, k: int, touched: bool) -> None:
         """Show or hide the disc after step `k`."""
         if touched:
             self._until = k + self._steps
-        if (k <= self._until) != self._shown:
-            self._shown = not self._shown
-            self._move(self._place if self._shown else BELOW_TABLE)
+        if (k <= self._until) != self._visible:
+            self._visible = not self._visible
+            self._move(self._place if self._visible else BELOW_TABLE)
 
     def _move(self, place: Sequence[float] | np.ndarray) -> None:
         self._disc.move_to(sapien.Pose(place, self._disc.pose.q))
@@ -181,7 +190,7 @@ class Trace:
 
     STEPS, RADIUS, HEIGHT, BELOW = 40, 0.005, 0.01, 0.1
 
-    def __init__(self, env: "Task") -> None:
+    def __init__(self, env: "Stage") -> None:
         self._env = env
         self._dots = [build_sphere(env, f"trace_{i}", self.RADIUS) for i in range(self.STEPS)]
 
@@ -191,7 +200,67 @@ class Trace:
             dot.move_to(sapien.Pose(BELOW_TABLE))
 
     def update(self, k: int) -> None:
-        """Draw the dot of step `k`; it takes the place of the one drawn 40 steps before."""
+        """Place the dot of step `k`; it replaces that of 40 steps before."""
         x, y, z = self._env.tcp_pose.p
         place = (x, y, self.HEIGHT) if z < self.BELOW else BELOW_TABLE
         self._dots[k % self.STEPS].move_to(sapien.Pose(place))
+
+
+type Place = Sequence[float] | np.ndarray
+
+CUE_RADIUS, CUE_HALF_LENGTH = 0.06, 0.001
+CUE_HEIGHT = 0.0015  # metres above the table: above it, and below what lies on it
+CUE_COLOURS: dict[str, RGB] = {**COLOURS, "white": WHITE, "yellow": (1.0, 0.8, 0.0)}
+TALLY_X, TALLY_RADIUS, TALLY_SPACING = 0.34, 0.015, 0.045
+"""Of the row of a tally: nearer to the front camera than any other object; metres."""
+
+
+@dataclass(frozen=True)
+class Cue:
+    """One disc. colour: of `CUE_COLOURS`. radius: metres."""
+
+    colour: str
+    place: Callable[[], Place | None]
+    """Where its centre is now [3], metres; None: not to be seen."""
+    radius: float = CUE_RADIUS
+
+
+def on_table(place: Place) -> tuple[float, float, float]:
+    """Where a disc lies that is centred at a place [2] or [3]."""
+    return float(place[0]), float(place[1]), CUE_HEIGHT
+
+
+def under(thing: Thing, colour: str = "white") -> Cue:
+    """A disc that lies under a thing, wherever it is."""
+    return Cue(colour, lambda: on_table(thing.position))
+
+
+def row(count: int) -> list[float]:
+    """Where so many discs of a tally lie across the table, about its middle; metres."""
+    return [TALLY_SPACING * (i - (count - 1) / 2) for i in range(count)]
+
+
+def tally(places: Sequence[float], left: Callable[[], int], colour: str = "yellow") -> list[Cue]:
+    """Discs at the front of the table, of which as many are to be seen as repetitions are left.
+
+    Args:
+        places: across the table, in metres; the last disc goes first.
+        left: counts the repetitions that are still to be done.
+        colour: of `CUE_COLOURS`.
+    """
+
+    def lie(i: int, y: float) -> Callable[[], Place | None]:
+        return lambda: on_table((TALLY_X, y)) if i < left() else None
+
+    return [Cue(colour, lie(i, y), TALLY_RADIUS) for i, y in enumerate(places)]
+
+
+def build_cue(env: "Stage", name: str, cue: Cue) -> Disc:
+    """A cue's disc, waiting below the table."""
+    return build_highlight(env, name, cue.radius, CUE_HALF_LENGTH, CUE_COLOURS[cue.colour])
+
+
+def show_cue(disc: Disc, cue: Cue) -> None:
+    """Move a disc to where its cue is now."""
+    place = cue.place()
+    disc.move_to(sapien.Pose(BELOW_TABLE if place is None else place, disc.pose.q))

@@ -1,22 +1,66 @@
-"""Random places on the table: draws are tried until an object keeps clear of those that are there already.
+"""Random numbers of a scene, and random places on the table that keep clear of the objects there.
 
-The tests are the official benchmark's, with their peculiarities, so that the same seed gives the same scene: an
-obstacle is the shadow of the first two axes of its bounding box, whichever these are, and what counts as the gap
-depends on what is placed.
+The same seed samples the same layout as the official benchmark. All layout randomness comes from CPU torch generators
+seeded with the episode's seed; the order of the samples is part of the benchmark's definition. So are the tests for a
+free place: an obstacle is the shadow of the first two axes of its bounding box, whichever these are, and what counts as
+the gap depends on what is placed.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 from mani_skill.utils.geometry.trimesh_utils import get_component_mesh
 from sapien import physx
+from torch import Tensor
 from trimesh import Trimesh
 
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import BUTTON_BASE, Board, Button, Disc, H
+from mme_vla.envs.scene.articulated import BUTTON_BASE, Button
+from mme_vla.envs.scene.objects import Board, Disc, H
 from mme_vla.envs.scene.things import Thing
+
+
+class Draws:
+    """One generator, with the few kinds of samples that scenes need."""
+
+    def __init__(self, seed: int) -> None:
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def uniform(self) -> float:
+        """One number in [0, 1)."""
+        return torch.rand(1, generator=self._generator).item()
+
+    def uniforms(self, n: int) -> Tensor:
+        """`n` numbers in [0, 1) in one call, float32 [n]; not the same stream as `n` single samples."""
+        return torch.rand(n, generator=self._generator)
+
+    def between(self, low: float, high: float) -> float:
+        """One number in [low, high), as torch's in-place `uniform_` gives it."""
+        return torch.empty(1).uniform_(low, high, generator=self._generator).item()
+
+    def integer(self, low: int, high: int) -> int:
+        """One integer in low … high - 1."""
+        return int(torch.randint(low, high, (1,), generator=self._generator).item())
+
+    def permutation(self, n: int) -> list[int]:
+        """The numbers 0 … n - 1 in random order."""
+        return torch.randperm(n, generator=self._generator).tolist()
+
+    def coin(self) -> bool:
+        """True in half of the cases: one uniform below 0.5."""
+        return self.uniform() < 0.5
+
+    def state(self) -> Tensor:
+        """Where the stream stands, for `restore`."""
+        return self._generator.get_state()
+
+    def restore(self, state: Tensor) -> None:
+        """Go back to where the stream stood when `state` was taken."""
+        self._generator.set_state(state)
+
 
 TRIALS = 256
 CONTAINER_HALF = 0.0275
@@ -32,18 +76,13 @@ class SceneError(RuntimeError):
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle on the table along its axes.
-
-    Args:
-        centre: metres.
-        half: half its width; one number, or one per axis.
-    """
+    """A rectangle along the table's axes; `half` is half its width, one number or one per axis; metres."""
 
     centre: tuple[float, float]
     half: float | tuple[float, float]
 
     def place(self, draws: Draws, margin: float) -> np.ndarray:
-        """Draw a point that keeps `margin` from the edges [2]; x is drawn first."""
+        """Sample a point that keeps `margin` from the edges [2]; x comes first."""
         half = self.half if isinstance(self.half, tuple) else (self.half, self.half)
         low = [c - h + margin for c, h in zip(self.centre, half, strict=True)]
         high = [c + h - margin for c, h in zip(self.centre, half, strict=True)]
@@ -54,10 +93,7 @@ class Region:
 class Box2D:
     """A rectangle on the table in any direction; an axis of length zero makes it a line.
 
-    Args:
-        centre: [2], metres.
-        axes: [2, 2], one direction a row.
-        half: half its width along each axis [2], metres.
+    centre: [2]. axes: [2, 2], one direction a row. half: half its width along each axis [2]; metres.
     """
 
     centre: np.ndarray
@@ -127,7 +163,7 @@ def _bounds(thing: Thing) -> Box2D | None:
 
 @lru_cache(maxsize=256)
 def _smallest_box(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Its place [4, 4] and widths [3]; an object is asked for again by each that is placed after it."""
+    """Pose [4, 4] and widths [3]; cached, since an object is an obstacle for all that are placed after it."""
     mesh = Trimesh(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3), process=False)
     box = mesh.bounding_box_oriented.primitive
     return np.array(box.transform), np.array(box.extents)
@@ -148,14 +184,13 @@ def board_boxes(board: Board) -> list[Box2D]:
 def draw_cube(
     draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005, yaw: bool = True, half: float = H
 ) -> tuple[np.ndarray, float] | None:
-    """Draw the place and the turn of a cube; targets are no obstacles.
+    """Sample the position and the yaw of a cube; targets are no obstacles.
 
     Args:
-        draws: the scene's random numbers.
         region: the cube keeps inside it, as if it were not turned.
         avoid: what it keeps clear of.
         gap: metres.
-        yaw: draw a turn too; otherwise the cube stands along the axes.
+        yaw: sample a yaw too; otherwise the cube is aligned with the axes.
         half: half its edge, metres.
 
     Returns:
@@ -164,20 +199,19 @@ def draw_cube(
     obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=0.0)
     for _ in range(TRIALS):
         xy = region.place(draws, half)
-        turn = 2 * np.pi * draws.uniform() if yaw else 0.0
-        cube = Box2D.square(xy, half + gap, turn)
+        angle = 2 * np.pi * draws.uniform() if yaw else 0.0
+        cube = Box2D.square(xy, half + gap, angle)
         if not any(cube.intersects(obstacle) for obstacle in obstacles):
-            return xy, turn
+            return xy, angle
     return None
 
 
 def draw_disc(
     draws: Draws, region: Region, radius: float, avoid: Sequence[Avoid] = (), gap: float = 0.005
 ) -> np.ndarray | None:
-    """Draw the centre of a target [2]; None when 256 trials have failed.
+    """Sample the centre of a target [2]; None when 256 trials have failed.
 
     Args:
-        draws: the scene's random numbers.
         region: the target lies wholly inside it.
         radius: metres.
         avoid: what it keeps clear of; other targets are circles.
@@ -196,10 +230,9 @@ def draw_disc(
 def draw_container(
     draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005
 ) -> tuple[np.ndarray, float] | None:
-    """Draw the place of a container and then its turn, 0 … 90°; the gap to other objects counts twice.
+    """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts twice.
 
     Args:
-        draws: the scene's random numbers.
         region: the container lies inside it.
         avoid: what it keeps clear of.
         gap: metres.
@@ -218,7 +251,7 @@ def draw_container(
 def draw_button(
     draws: Draws, centre: tuple[float, float], range: tuple[float, float] = (0.1, 0.4)
 ) -> tuple[float, float]:
-    """Draw the centre of a button in a rectangle of the given widths, metres."""
+    """Sample the centre of a button in a rectangle of these widths, metres."""
     x, y = (draws.uniforms(2) - 0.5).tolist()
     return centre[0] + x * range[0], centre[1] + y * range[1]
 
@@ -235,3 +268,36 @@ def _obstacles(avoid: Sequence[Avoid], grow: float) -> list[Box2D]:
         else:
             boxes.append(obstacle_box(item).grown(grow))
     return boxes
+
+
+type Point = tuple[float, float]
+
+ANCHOR_HALF = 0.07
+"""Half the side of the square around an anchor in which an object is placed, metres."""
+ANGLE_RANGE = 180
+"""Radians, although meant as degrees: in effect any angle."""
+SHIFT = 0.1
+"""How far anchors that are not rotated may be shifted, metres."""
+
+
+def rotated_anchors(draws: Draws, count: int) -> list[Point]:
+    """Three anchors in a triangle or on a line, or four in a square, rotated about the table's middle."""
+    on_line = draws.integer(0, 2)  # sampled for four anchors, too
+    angle = draws.uniform() * ANGLE_RANGE
+    triangle = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]
+    line = [(0.0, -0.15), (0.0, 0.15), (0.0, 0.0)]
+    square = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.1), (0.1, -0.1)]
+    anchors = square if count == len(square) else line if on_line else triangle
+    cos, sin = math.cos(angle), math.sin(angle)
+    return [(cos * x - sin * y, sin * x + cos * y) for x, y in anchors]
+
+
+def shifted_anchors(draws: Draws, count: int) -> list[Point]:
+    """Three anchors in a triangle or on a line, each shifted forward, or four of which pairs are shifted sideways."""
+    left, right = (draws.uniform() * SHIFT for _ in range(2))
+    a, b = ([draws.uniform() * SHIFT for _ in range(3)] for _ in range(2))
+    on_line = draws.integer(0, 2)
+    triangle = [(-0.05 + a[0], -0.15), (-0.05 + a[1], 0.15), (0.05 + a[2], 0.0)]
+    line = [(-0.05 + b[0], -0.15), (-0.05 + b[1], 0.15), (-0.05 + b[2], 0.0)]
+    square = [(0.0, -0.1 + left), (0.0, 0.1 + left), (0.1, 0.1 + right), (0.1, -0.1 + right)]
+    return square if count == len(square) else line if on_line else triangle

@@ -1,4 +1,4 @@
-"""What can be asked of the scene: picked up, dropped, pressed, over, static. Thresholds are the benchmark's."""
+"""Predicates on objects and the robot: picked up, dropped, pressed, over, static. Thresholds are the benchmark's."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -8,8 +8,8 @@ import numpy as np
 from mme_vla.envs.scene.things import Thing, distance_xy
 
 if TYPE_CHECKING:
-    from mme_vla.envs.scene.objects import Button
-    from mme_vla.envs.task import Task
+    from mme_vla.envs.scene.articulated import Button
+    from mme_vla.envs.scene.stage import Stage
 
 PICKED_UP_Z = 0.05
 CONTAINER_PICKED_UP_Z = 0.15
@@ -20,35 +20,35 @@ PRESSED = 0.005
 FINGER_OPEN = 0.02
 
 
-def picked_up(env: "Task", thing: Thing) -> bool:
+def picked_up(env: "Stage", thing: Thing) -> bool:
     """A cube or a peg's end is grasped and off the table."""
     return thing.position[2] > PICKED_UP_Z and env.is_grasping(thing)
 
 
-def any_picked_up(env: "Task", things: Iterable[Thing]) -> bool:
+def any_picked_up(env: "Stage", things: Iterable[Thing]) -> bool:
     """Whether one of the objects is picked up."""
     return any(picked_up(env, thing) for thing in things)
 
 
 def container_picked_up(container: Thing) -> bool:
-    """A container is lifted high, whoever holds it."""
+    """A container is lifted high."""
     return container.position[2] > CONTAINER_PICKED_UP_Z
 
 
-def container_put_down(env: "Task", container: Thing) -> bool:
+def container_put_down(env: "Stage", container: Thing) -> bool:
     """A container stands on the table again and the gripper has left it."""
     return container.position[2] <= 0.07 and not env.is_grasping(container) and env.tcp_pose.p[2] > 0.05
 
 
-def dropped(env: "Task", thing: Thing) -> bool:
+def dropped(env: "Stage", thing: Thing) -> bool:
     """The object was let go: near the table. While recording it may still be falling, if the gripper is away."""
     z = thing.position[2]
     low = (z <= 0.2 and env.tcp_pose.p[2] > 0.05) if env.recording else z <= 0.035
     return bool(low) and not env.is_grasping(thing)
 
 
-def dropped_onto(env: "Task", thing: Thing, target: Thing) -> bool:
-    """The object was let go on the target."""
+def dropped_onto(env: "Stage", thing: Thing, target: Thing) -> bool:
+    """The object was released on the target."""
     return distance_xy(thing.position, target.position) <= ON_TARGET and dropped(env, thing)
 
 
@@ -63,27 +63,27 @@ def over(position: np.ndarray, target: Thing, distance: float = 0.01, height: fl
 
 
 def pressed(button: "Button") -> bool:
-    """The button is held down at this moment."""
+    """The button is held down at this time step."""
     return button.depth > PRESSED
 
 
-def hovering(env: "Task", button: "Button") -> bool:
+def hovering(env: "Stage", button: "Button") -> bool:
     """The tool is above the button, low."""
     tcp = env.tcp_pose.p
     return distance_xy(tcp, button.position) <= 0.03 and bool(tcp[2] < 0.2)
 
 
-def gripper_open(env: "Task") -> bool:
+def gripper_open(env: "Stage") -> bool:
     """Both fingers are apart."""
     return bool((env.fingers > FINGER_OPEN).all())
 
 
-def released_and_away(env: "Task", thing: Thing) -> bool:
+def released_and_away(env: "Stage", thing: Thing) -> bool:
     """The gripper is open and has left the object."""
     return gripper_open(env) and float(np.linalg.norm(env.tcp_pose.p - thing.position)) > 0.02
 
 
-def reset_reached(env: "Task", reference: np.ndarray, tolerance: float = 0.01) -> bool:
+def reset_reached(env: "Stage", reference: np.ndarray, tolerance: float = 0.01) -> bool:
     """The arm is back at the reference joint positions [n], radians."""
     return float(np.abs(env.qpos[: len(reference)] - reference).max()) < tolerance
 
@@ -94,7 +94,7 @@ class StaticFor:
     LIMIT = 0.2
     """Joint velocity above which the arm moves, rad/s."""
 
-    def __init__(self, env: "Task", steps: int) -> None:
+    def __init__(self, env: "Stage", steps: int) -> None:
         self._env, self._steps = env, steps
         self._since: int | None = None
 

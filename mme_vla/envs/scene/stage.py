@@ -1,4 +1,4 @@
-"""The stage of a task: robot, table, cameras and the clock, before there is anything to do."""
+"""The stage of a task: robot, table, cameras and the step counter."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -12,10 +12,9 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.envs.rendering import keep_renderer
+from mme_vla.envs.rendering import keep_renderer, lean_shaders
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.things import Thing, pose_of
-from mme_vla.envs.shaders import lean_shaders
 
 RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
 """Joint angles at the start of every episode, and the target of the reset action; radians."""
@@ -23,20 +22,15 @@ FIELD_OF_VIEW = np.pi / 2
 
 
 class Stage(BaseEnv):
-    """A robot at a table under two cameras. What stands on the table, and why, is the script's: `Task`.
-
-    Args:
-        seed: fixes the scene and the script; the `seed` of `reset` has no effect.
-        second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
-    """
+    """A robot at a table under two cameras; `Task` adds the objects and the script."""
 
     SUPPORTED_REWARD_MODES = ("none", "dense")
     stick: ClassVar[bool] = False
     """The robot holds a stick instead of a gripper."""
     spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
-    """From where, and to where, the camera for people looks; no policy sees its pictures."""
+    """From where, and to where, the camera for people looks; no policy sees its images."""
 
-    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the cameras' settings that were asked for
+    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the requested camera settings
 
     def __init__(
         self,
@@ -49,6 +43,8 @@ class Stage(BaseEnv):
     ) -> None:
         self.seed = seed
         self.second_tries = second_tries
+        self.recording = False
+        """A demonstrator is recording: `dropped` is evaluated as it was when the official data were recorded."""
         self.reset_in_progress = False
         """The arm is being driven back between the conditioning video and the execution."""
         self.after_video = False
@@ -78,10 +74,10 @@ class Stage(BaseEnv):
             keep_renderer(self._render_device)
 
     def _clear(self) -> None:
-        """Give up the scene. What it holds points back to it, so this circle is cut here.
+        """Release the scene by cutting its reference cycle.
 
-        ManiSkill has all garbage of the process collected instead, before and after every episode: 0.4 s of the 0.5 s
-        that an episode without pictures takes to begin and end.
+        ManiSkill collects all garbage instead, which is 0.4 s of the 0.5 s that an episode without images
+        takes to begin and end.
         """
         self._close_viewer()
         if self.scene is not None:
@@ -89,13 +85,13 @@ class Stage(BaseEnv):
         self.__dict__.update(scene=None, agent=None, _sensors={}, _human_render_cameras={}, _hidden_objects=[])
 
     def _setup_sensors(self, options: dict) -> None:
-        asked = self._custom_sensor_configs
+        configs = self._custom_sensor_configs
         lit_by_lamps = self.scene.sub_scenes[0].render_system.cubemap is None
-        if not asked and lit_by_lamps and self._render_device.is_cpu():
+        if not configs and lit_by_lamps and self._render_device.is_cpu():
             lean = lean_shaders()
             self._custom_sensor_configs = {} if lean is None else {"shader_config": lean}
         super()._setup_sensors(options)
-        self._custom_sensor_configs = asked
+        self._custom_sensor_configs = configs
 
     def set_up(self) -> None:
         """Put up the table, with nothing on it."""
@@ -112,7 +108,7 @@ class Stage(BaseEnv):
         self.reset_in_progress = self.after_video = False
         self.stored_qpos = None
 
-    # The clock ----------------------------------------------------------------------------------------------------
+    # Steps --------------------------------------------------------------------------------------------------------
 
     @property
     def steps_done(self) -> int:

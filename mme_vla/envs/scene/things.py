@@ -1,4 +1,4 @@
-"""What stands on the table, as the tasks see it: an entity with a name, a place, and a place to go back to."""
+"""Objects of a scene as the tasks use them: an entity with a name, a pose, and a pose to be restored to."""
 
 from typing import Any
 
@@ -60,11 +60,11 @@ class Thing:
         """Draw the object, or leave it out, as its height says: due where its pose was set from outside."""
         self._draw(bool(self.position[2] > UNDER_THE_FLOOR))
 
-    def _draw(self, drawn: bool) -> None:
-        """Leave out of the pictures what the floor hides anyway: dozens of marks cost a third of the rendering."""
+    def _draw(self, visible: bool) -> None:
+        """Leave out of the images what the floor hides anyway: dozens of marks cost a third of the rendering."""
         body = self.entity._objs[0].find_component_by_type(RenderBodyComponent) if self._may_sink else None
-        if body is not None and bool(body.visibility) != drawn:
-            body.visibility = float(drawn)
+        if body is not None and bool(body.visibility) != visible:
+            body.visibility = float(visible)
 
     def displace(self, pose: sapien.Pose) -> None:
         """Teleport the object in the midst of its motion: it keeps its velocity."""

@@ -6,18 +6,16 @@ from itertools import islice
 
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.scene.cues import Cue, row, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Appear
-from mme_vla.envs.scene.objects import Cube, H, build_board, build_button, build_cube
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Appear, Cue, row, tally
+from mme_vla.envs.scene.objects import Cube, H, build_board, build_cube
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import press
 
 # Both bounds belong to the range.
 AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
@@ -37,7 +35,7 @@ class BinFill(Task):
     shared_draws = True
     spectator = ((1, 0, 0.4), (0, 0, 0.4))
     latch_failure = True
-    recovery_drawn_per_episode = True
+    recovery_sampled_per_episode = True
 
     def build(self, draws: Draws) -> None:
         self.streaming = draws.integer(0, 2) == 0
@@ -45,10 +43,10 @@ class BinFill(Task):
         x, y = -0.05 + 0.2 * draws.uniform(), -0.2 + 0.4 * draws.uniform()
         self.board = self.add(build_board(self, (x, y), math.radians(-20 + 40 * draws.uniform())))
         self._draw_counts(draws)
-        wanted = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
+        colours = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
-        for i in draws.permutation(len(wanted)):
-            colour = wanted[i]
+        for i in draws.permutation(len(colours)):
+            colour = colours[i]
             place = draw_cube(draws, TABLE, [self.button, self.board, *self.all_cubes()], gap=H)
             if place is not None:
                 cubes = self.cubes[colour]
@@ -61,11 +59,11 @@ class BinFill(Task):
         """How many cubes of each colour belong into the bin, and how many lie on the table."""
         available = [COLOURS[i] for i in draws.permutation(3)][: AVAILABLE[self.difficulty]]
         low, high = GOAL_COLOURS[self.difficulty]
-        chosen = available[: draws.integer(low, high + 1)]
+        selected = available[: draws.integer(low, high + 1)]
         low, high = GOAL_CUBES[self.difficulty]
         total = draws.integer(low, high + 1)
-        picks = [0] * total if len(chosen) == 1 else [draws.integer(0, len(chosen)) for _ in range(total)]
-        self.goal = Counter(chosen[i] for i in picks)
+        picks = [0] * total if len(selected) == 1 else [draws.integer(0, len(selected)) for _ in range(total)]
+        self.goal = Counter(selected[i] for i in picks)
         low, high = CUBES[self.difficulty]
         cubes = draws.integer(low, high + 1)
         self.spawned = Counter({colour: max(1, self.goal[colour]) for colour in available})
@@ -127,16 +125,7 @@ class BinFill(Task):
             for i in range(self.goal[colour])
             for step in (self._pick(i, self.cubes[colour][i]), self._drop())
         ]
-        press = SubTask(
-            "press the button",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <>",
-            targets=[self.button],
-            choice="c",
-            operation="how many",
-        )
-        return [*steps, press]
+        return [*steps, press(self.button, "press the button", "c", operation="how many")]
 
     def _pick(self, i: int, cube: Cube) -> SubTask:
         return SubTask(

@@ -1,13 +1,9 @@
 """ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Cover
-from mme_vla.envs.scene.objects import build_button
-from mme_vla.envs.scene.placement import draw_button
-from mme_vla.envs.scene.predicates import pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cover, Cue, under
+from mme_vla.envs.scene.placement import Draws, draw_button
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (
@@ -17,6 +13,7 @@ from mme_vla.envs.tasks.families.containers import (
     container_picks,
     hiding_goal,
 )
+from mme_vla.envs.tasks.families.stages import press
 from mme_vla.envs.tasks.video_unmask import CONTAINERS, PICKS
 
 LETTERS = ("b", "c")
@@ -46,25 +43,18 @@ class ButtonUnmask(Task):
 
     def draw_failed_pick(self, draws: Draws, picks: int) -> int | None:
         # Here alone the stream is one of its own, in which a number without effect comes first.
-        own = Draws(self.seed)
-        own.integer(1, 6)
-        return own.integer(0, picks)
+        local_draws = Draws(self.seed)
+        local_draws.integer(1, 6)
+        return local_draws.integer(0, picks)
 
     def subtasks(self) -> list[SubTask]:
-        press = SubTask(
-            "press the button",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <>",
-            targets=[self.button],
-            choice="a",
-        )
-        wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
-        return [press, *container_picks(self, wanted, self.containers, LETTERS)]
+        targets = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
+        picks = container_picks(self, targets, self.containers, LETTERS)
+        return [press(self.button, "press the button", "a"), *picks]
 
     def choices(self) -> list[Choice]:
-        press = Choice("a", "press the button", lambda demo, _: demo.press(self.button))
-        return [press, *container_choices(self.containers, LETTERS)]
+        push = Choice("a", "press the button", lambda demo, _: demo.press(self.button))
+        return [push, *container_choices(self.containers, LETTERS)]
 
     def goals(self) -> list[str]:
         return [f"first press the button, then {hiding_goal(self.colours[: PICKS[self.difficulty]])}"]

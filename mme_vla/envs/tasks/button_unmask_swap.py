@@ -1,15 +1,17 @@
 """ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up the right one."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.anchors import shifted_anchors
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Button, build_button
-from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.articulated import Button, build_button
+from mme_vla.envs.scene.placement import Draws, draw_button, shifted_anchors
 from mme_vla.envs.scene.predicates import pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.containers import container_choices, container_picks, hiding_goal
-from mme_vla.envs.tasks.families.unmask_swap import CONTAINERS, UnmaskSwap
+from mme_vla.envs.tasks.families.containers import (
+    CONTAINERS,
+    UnmaskSwap,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 
 LETTERS = ("c", "d")
 
@@ -31,7 +33,7 @@ class ButtonUnmaskSwap(UnmaskSwap):
 
     def subtasks(self) -> list[SubTask]:
         presses = [self._press("first", self.right, "a"), self._press("second", self.left, "b")]
-        return [*presses, *container_picks(self, self.wanted, self.containers, LETTERS)]
+        return [*presses, *container_picks(self, self.targets, self.containers, LETTERS)]
 
     def _press(self, which: str, button: Button, choice: str) -> SubTask:
         """Press the button that is shown, or the other one if it has not been pressed yet."""
@@ -58,4 +60,4 @@ class ButtonUnmaskSwap(UnmaskSwap):
         ]
 
     def goals(self) -> list[str]:
-        return [f"first press both buttons on the table, then {hiding_goal([colour for colour, _ in self.wanted])}"]
+        return [f"first press both buttons on the table, then {hiding_goal([colour for colour, _ in self.targets])}"]

@@ -8,22 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
 from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.robot.peg_skills import PegEnd
+from mme_vla.envs.robot.demonstrator import PegEnd
 from mme_vla.envs.robot.robots import ROBOT_BASE
-from mme_vla.envs.scene.cues import Cue, on_table
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Highlight, Mark, build_mark
-from mme_vla.envs.scene.objects import build_aperture_box, build_highlight, build_peg
-from mme_vla.envs.scene.objects.shapes import at
-from mme_vla.envs.scene.objects.solids import APERTURE_COLOUR, APERTURE_Z
-from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, reset_reached
+from mme_vla.envs.scene.articulated import build_peg
+from mme_vla.envs.scene.motions import Cue, Highlight, Mark, build_mark, on_table
+from mme_vla.envs.scene.objects import APERTURE_COLOUR, APERTURE_Z, at, build_aperture_box, build_highlight
+from mme_vla.envs.scene.placement import Draws, SceneError
+from mme_vla.envs.scene.predicates import StaticFor, any_picked_up
 from mme_vla.envs.scene.things import Thing
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import end_video
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -34,11 +31,11 @@ TRIES = 256
 ENDS: tuple[PegEnd, PegEnd] = ("head", "tail")
 LIFTED_Z = 0.1
 INSERTED = 0.05
-SHOWN_STEPS = 20  # how long the box shows an insertion
+DISPLAY_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
-"""How far from the box and from other pegs the hand has room around a peg, metres."""
-SIDEWAYS = -0.4  # cosine between the way from a near box and the way a peg may be drawn: a little past sideways
+"""Free distance that the hand needs around a peg: to the box, to other pegs; metres."""
+SIDEWAYS = -0.4  # cosine between the way from a near box and the way a peg may be pulled: a little past sideways
 WORKSPACE = (0.4, 0.72)  # nearest and farthest from the robot's base that a peg is moved to, metres
 FLUNG = 0.05  # from its place in one step, metres
 MARK = (0.015, 0.055)  # radius and half length of the disc on the box
@@ -46,7 +43,7 @@ MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 @register_task
 class InsertPeg(Task):
-    """The first peg is the one; places are drawn per episode and the difficulty changes nothing."""
+    """The first peg is the target; positions are sampled per episode, and the difficulty has no effect."""
 
     shared_draws = True
 
@@ -76,7 +73,7 @@ class InsertPeg(Task):
         self.side = (-1, 1)[draws.integer(0, 2)]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
-        self.mark = Mark(self._red_disc, self.box.position, SHOWN_STEPS)
+        self.mark = Mark(self._red_disc, self.box.position, DISPLAY_STEPS)
         self._helpful, self._restoring = 0, False
 
     def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
@@ -101,7 +98,8 @@ class InsertPeg(Task):
     def _flung(self) -> bool:
         """Whether the peg left at once where it was put back: it keeps what speed the hand or the box gave it.
 
-        No official episode shows that, since its demonstrator could not go on from there; the peg is laid down at rest.
+        No official episode shows that, since its demonstrator could not continue from there; the peg is laid down at
+        rest.
         """
         return float(np.linalg.norm(self.peg.position - self.peg.initial_pose.p)) > FLUNG
 
@@ -131,12 +129,7 @@ class InsertPeg(Task):
 
     def subtasks(self) -> list[SubTask]:
         between = [
-            SubTask(
-                NO_RECORD,
-                done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
-                run=lambda demo: demo.hard_reset(),
-                video=True,
-            ),
+            end_video(self),
             SubTask(NO_RECORD, StaticFor(self, HOLD_STEPS), lambda demo: demo.hold(HOLD_STEPS), video=True),
         ]
         return [*self._both(video=True), *between, *self._both(video=False)]
@@ -195,7 +188,7 @@ class InsertPeg(Task):
         for drag in plans[self._helpful :]:
             if drag is not None:
                 with suppress(PlanningError):
-                    demo.drag_peg(self.peg, drag[0], self._way_out(), turn=drag[1])
+                    demo.drag_peg(self.peg, drag[0], self._way_out(), flip=drag[1])
             with suppress(PlanningError):  # out of reach, for instance
                 demo.grasp_peg(self.peg, self.end)
             if self._lifted(self.end):
@@ -211,15 +204,15 @@ class InsertPeg(Task):
         others = [peg.position[:2] for peg in self.pegs[1:]]
 
         def is_open(place: np.ndarray) -> bool:
-            near, far = WORKSPACE
-            reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < far
+            near, farthest = WORKSPACE
+            reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < farthest
             apart = np.linalg.norm(place - self.box.position[:2]) > OPEN_FROM_BOX
             return bool(reached and apart and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others))
 
         angles, lengths = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(0.04, 0.4, 0.02)
         ways = [length * np.array([np.cos(angle), np.sin(angle)]) for length in lengths for angle in angles]
         away = middle - self.box.position[:2]
-        # A peg beside the box is not drawn through it; one that is only far away may come nearer.
+        # A peg beside the box is not pulled through it; one that is only far away may come nearer.
         beside = np.linalg.norm(away) < OPEN_FROM_BOX
         most = SIDEWAYS * np.linalg.norm(away)
         open_ways = (w for w in ways if (not beside or w @ away >= most * np.linalg.norm(w)) and is_open(middle + w))
@@ -232,19 +225,19 @@ class InsertPeg(Task):
             lambda: demo.insert_peg(*task),
             lambda: demo.insert_peg_fully(*task, begun=True),
             lambda: demo.insert_peg_fully(*task),
-            lambda: self._insert_anew(demo, turn=True),
-            lambda: self._insert_anew(demo, turn=False),
+            lambda: self._insert_anew(demo, flip=True),
+            lambda: self._insert_anew(demo, flip=False),
         ]
         for attempt in tries if self.second_tries else tries[:1]:
             if not self._inserted(self.end, self.side):
                 with suppress(PlanningError):
                     attempt()
 
-    def _insert_anew(self, demo: "Demonstrator", turn: bool) -> None:
+    def _insert_anew(self, demo: "Demonstrator", flip: bool) -> None:
         demo.withdraw()
         if any(self.is_grasping(end) for end in self.ends(self.end)):
             demo.lay_down_peg(self._way_out())
-        demo.grasp_peg(self.peg, self.end, turn)
+        demo.grasp_peg(self.peg, self.end, flip)
         if self._lifted(self.end):
             demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
 

@@ -6,21 +6,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import PEG_COLOUR, H, build_cube, build_disc, build_peg
-from mme_vla.envs.scene.objects.shapes import at
-from mme_vla.envs.scene.placement import Region, SceneError, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.articulated import PEG_COLOUR, build_peg
+from mme_vla.envs.scene.objects import H, at, build_cube, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
+from mme_vla.envs.scene.predicates import dropped_onto, gripper_open, picked_up, pushed_onto
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import end_video, pick, wait
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
-TOLD = {
+MANNER_TEXTS = {
     "hook": "hook the cube with the peg",
     "push": "push the cube with the closed gripper",
     "grasp": "pick up the cube and place it",
@@ -44,15 +43,15 @@ class MoveCube(Task):
     def build(self, draws: Draws) -> None:
         for _ in range(2):
             draws.uniform()  # part of the official stream, without effect
-        shown_peg, peg = self._draw_peg(draws), self._draw_peg(draws)
+        video_peg, peg = self._draw_peg(draws), self._draw_peg(draws)
         for _ in range(2):
             draws.integer(0, 2)
-        shown_goal, goal = (self._draw_goal(draws, half) for half in (0.15, 0.1))
+        video_goal, goal = (self._draw_goal(draws, half) for half in (0.15, 0.1))
         self.peg = self.add(
-            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, shown_peg[:2], shown_peg[2])
+            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, video_peg[:2], video_peg[2])
         )
-        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", shown_goal))
-        xy, yaw = self._draw_cube(draws, shown_goal, [])
+        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal))
+        xy, yaw = self._draw_cube(draws, video_goal, [])
         self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
         xy, yaw = self._draw_cube(draws, goal, [self.cube])
         self._execution_poses = {
@@ -92,16 +91,7 @@ class MoveCube(Task):
                 thing.displace(pose)
 
     def subtasks(self) -> list[SubTask]:
-        steps = HOLD_STEPS[self.manner] + self.turned("delay")
-        between = [
-            SubTask("static", StaticFor(self, steps), lambda demo: demo.hold(steps), video=True),
-            SubTask(
-                NO_RECORD,
-                done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
-                run=lambda demo: demo.hard_reset(),
-                video=True,
-            ),
-        ]
+        between = [wait(self, HOLD_STEPS[self.manner] + self.turned("delay")), end_video(self)]
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
         return [*moves(video=True), *between, *moves(video=False)]
 
@@ -176,18 +166,11 @@ class MoveCube(Task):
         ]
 
     def _grasp(self, video: bool) -> list[SubTask]:
+        def misplaced() -> bool:
+            return self._on_target() or self._holds_peg()
+
         return [
-            SubTask(
-                "Pick up the cube",
-                done=self._holds_cube,
-                run=lambda demo: demo.pick(self.cube),
-                grounded="Pick up the cube at <>",
-                failed=lambda: self._on_target() or self._holds_peg(),
-                targets=[self.cube],
-                choice="d",
-                video=video,
-                operation="how",
-            ),
+            pick(self, self.cube, "Pick up the cube", "d", failed=misplaced, video=video, operation="how"),
             SubTask(
                 "place the cube onto the target",
                 done=lambda: dropped_onto(self, self.cube, self.target),
@@ -218,5 +201,5 @@ class MoveCube(Task):
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then move the cube to the target in the same manner"
-        told = f": {TOLD[self.manner]}" if self.in_view else ""
-        return [f"{goal} as before{told}", f"{goal} shown in the video{told}"]
+        manner = f": {MANNER_TEXTS[self.manner]}" if self.in_view else ""
+        return [f"{goal} as before{manner}", f"{goal} shown in the video{manner}"]

@@ -5,17 +5,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.scene.objects import Disc, build_disc
-from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.scene.placement import Draws, SceneError
 from mme_vla.envs.scene.predicates import over
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stick import back_to_start
+from mme_vla.envs.tasks.families.stages import end_stick_video
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -93,7 +91,7 @@ class PatternLock(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *back_to_start(self), *self._moves(video=False)]
+        return [approach, *self._moves(video=True), *end_stick_video(self), *self._moves(video=False)]
 
     def _moves(self, video: bool) -> list[SubTask]:
         return [self._move(a, b, video) for a, b in zip(self.path, self.path[1:], strict=False)]
@@ -149,7 +147,7 @@ class PatternLock(Task):
         return [goal, f"{goal} shown in the video"]
 
 
-def search(draws: Draws, n: int, node: int, goal: int, seen: set[int]) -> list[int] | None:
+def search(draws: Draws, n: int, node: int, goal: int, visited: set[int]) -> list[int] | None:
     """A path over the 8-neighbourhood of an n × n grid by depth-first search in random order."""
     if node == goal:
         return [node]
@@ -157,9 +155,9 @@ def search(draws: Draws, n: int, node: int, goal: int, seen: set[int]) -> list[i
     places = [(row + r, column + c) for r, c in NEIGHBOURS if 0 <= row + r < n and 0 <= column + c < n]
     for i in draws.permutation(len(places)):
         following = places[i][0] * n + places[i][1]
-        if following not in seen:
-            seen.add(following)
-            path = search(draws, n, following, goal, seen)
+        if following not in visited:
+            visited.add(following)
+            path = search(draws, n, following, goal, visited)
             if path is not None:
                 return [node, *path]
     return None

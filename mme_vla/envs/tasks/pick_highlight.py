@@ -1,16 +1,14 @@
 """PickHighlight (Reference): some cubes are briefly underlaid with white; press the button, then pick up just those."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import ordinal
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Highlight
-from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_highlight
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
-from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, Highlight, under
+from mme_vla.envs.scene.objects import Cube, H, build_highlight
+from mme_vla.envs.scene.placement import Draws, Region, draw_button
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up
+from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import add_cube, pick, press
 
 CUBES = {"easy": 3, "medium": 4, "hard": 6}
 GOALS = {"easy": 1, "medium": 2, "hard": 3}
@@ -30,19 +28,17 @@ class PickHighlight(Task):
         self.cubes: list[Cube] = []
         for i in range(CUBES[self.difficulty]):
             colour = ("red", "blue", "green")[draws.integer(0, 3)]
-            place = draw_cube(draws, Region((-0.1, 0), 0.2), [self.button, *self.cubes], gap=2 * H)
-            if place is None:
-                raise SceneError(f"PickHighlight, seed {self.seed}: cube {i} finds no place.")
-            self.cubes.append(self.add(build_cube(self, f"cube_{i}", colour, *place)))
+            avoid = [self.button, *self.cubes]
+            self.cubes.append(add_cube(self, draws, f"cube_{i}", colour, Region((-0.1, 0), 0.2), avoid, gap=2 * H))
         self.goal_cubes = [self.cubes[i] for i in draws.permutation(len(self.cubes))[: GOALS[self.difficulty]]]
         self._discs = [build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(self.goal_cubes))]
 
         for i in range(self.turned("distractors")):
             colour = ("red", "blue", "green")[draws.integer(0, 3)]
-            place = draw_cube(draws, Region((-0.1, 0), 0.2), [self.button, *self.cubes], gap=2 * H)
-            if place is None:
-                raise SceneError(f"PickHighlight, seed {self.seed}: distractor {i} finds no place.")
-            self.cubes.append(self.add(build_cube(self, f"distractor_{i}", colour, *place)))
+            avoid = [self.button, *self.cubes]
+            self.cubes.append(
+                add_cube(self, draws, f"distractor_{i}", colour, Region((-0.1, 0), 0.2), avoid, gap=2 * H)
+            )
 
     def cues(self) -> list[Cue]:
         return [under(cube) for cube in self.goal_cubes]
@@ -65,16 +61,7 @@ class PickHighlight(Task):
         return len(self.picked) == len(self.goal_cubes)
 
     def subtasks(self) -> list[SubTask]:
-        steps = [
-            SubTask(
-                "press the button",
-                done=lambda: pressed(self.button),
-                run=lambda demo: demo.press(self.button),
-                grounded="press the button at <>",
-                targets=[self.button],
-                choice="a",
-            )
-        ]
+        steps = [press(self.button, "press the button", "a")]
         for i, cube in enumerate(self.goal_cubes):
             if i:
                 steps.append(self._place(self.goal_cubes[i - 1]))
@@ -83,16 +70,7 @@ class PickHighlight(Task):
 
     def _pick(self, i: int, cube: Cube) -> SubTask:
         which = "highlighted cube" if len(self.goal_cubes) == 1 else f"{ordinal(i)} highlighted cube"
-        return SubTask(
-            f"pick up the {which}, which is {cube.colour}",
-            done=lambda: picked_up(self, cube),
-            run=lambda demo: demo.pick(cube),
-            grounded=f"pick up the {which} at <>, which is {cube.colour}",
-            targets=[cube],
-            choice="b",
-            pick=True,
-            operation="which",
-        )
+        return pick(self, cube, f"pick up the {which}, which is {cube.colour}", "b", pick=True, operation="which")
 
     def _place(self, cube: Cube) -> SubTask:
         return SubTask(

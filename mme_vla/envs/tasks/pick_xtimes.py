@@ -1,15 +1,14 @@
 """PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.scene.cues import Cue, row, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_disc
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import any_picked_up, dropped_onto, picked_up, pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, row, tally
+from mme_vla.envs.scene.objects import Cube, H, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_disc
+from mme_vla.envs.scene.predicates import any_picked_up, dropped_onto, pressed
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import add_cube, pick, press
 
 COLOURS = ("red", "blue", "green")
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
@@ -32,13 +31,10 @@ class PickXtimes(Task):
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0.0))))
         colours = [COLOURS[i] for i in draws.permutation(3)][: CUBES[self.difficulty]]
-        draws.integer(0, 3)  # drawn, and not used, in the official scene
+        draws.integer(0, 3)  # part of the official stream, without effect
         self.cubes: list[Cube] = []
         for colour in colours:
-            place = draw_cube(draws, TABLE, [self.button, *self.cubes], gap=H)
-            if place is None:
-                raise SceneError(f"PickXtimes, seed {self.seed}: the {colour} cube finds no place.")
-            self.cubes.append(self.add(build_cube(self, f"cube_{colour}", colour, *place)))
+            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, [self.button, *self.cubes]))
         xy = draw_disc(draws, TABLE, TARGET_RADIUS, [self.button, *self.cubes], gap=2 * H)
         if xy is None:
             raise SceneError(f"PickXtimes, seed {self.seed}: the target finds no place.")
@@ -55,30 +51,12 @@ class PickXtimes(Task):
         steps = []
         for i in range(self.repetitions):
             steps += [self._pick(i), self._place()]
-        press = SubTask(
-            "press the button to stop",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <> to stop",
-            failed=lambda: any_picked_up(self, self.cubes),
-            targets=[self.button],
-            choice="c",
-            operation="how many",
-        )
-        return [*steps, press]
+        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
+        return [*steps, press(self.button, "press the button to stop", "c", **stop)]
 
     def _pick(self, i: int) -> SubTask:
-        return SubTask(
-            f"pick up the {self.cube.colour} cube for the {ordinal(i)} time",
-            done=lambda: picked_up(self, self.cube),
-            run=lambda demo: demo.pick(self.cube),
-            grounded=f"pick up the {self.cube.colour} cube at <> for the {ordinal(i)} time",
-            failed=self._strayed,
-            targets=[self.cube],
-            choice="a",
-            pick=True,
-            operation=self._mistaken,
-        )
+        text = f"pick up the {self.cube.colour} cube for the {ordinal(i)} time"
+        return pick(self, self.cube, text, failed=self._strayed, pick=True, operation=self._mistaken)
 
     def _place(self) -> SubTask:
         return SubTask(

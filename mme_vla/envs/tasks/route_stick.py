@@ -6,31 +6,29 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.robot.stick_skills import arc
-from mme_vla.envs.scene.cues import Cue, Place, on_table
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Mark, Trace, build_mark
+from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
 from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.predicates import over
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stick import back_to_start
+from mme_vla.envs.tasks.families.stages import end_stick_video
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
 
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
-VISIT, VISIT_HEIGHT = 0.03, 0.15
+REACH_RADIUS, REACH_HEIGHT = 0.03, 0.15
 MARK_RADIUS, MARK_STEPS = 0.02004, 40
 HOME_STEPS = 200
 CUE_RADIUS, DOT_RADIUS = 0.04, 0.01
 DOTS = range(8, 40, 7)  # of an arc's 45 points
-Turn = Literal["clockwise", "counterclockwise"]
-SIDES: tuple[tuple[str, Turn], ...] = (
+Direction = Literal["clockwise", "counterclockwise"]
+SIDES: tuple[tuple[str, Direction], ...] = (
     ("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"),
 )  # fmt: skip
 
@@ -44,8 +42,8 @@ class RouteStick(Task):
 
     def build(self, draws: Draws) -> None:
         angle = math.radians(-30 + 60 * draws.uniform())
-        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        places = [turn @ (CENTRE_X, (i - PLACES // 2) * SPACING) for i in range(PLACES)]
+        rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        places = [rotation @ (CENTRE_X, (i - PLACES // 2) * SPACING) for i in range(PLACES)]
         self.all_discs = [
             self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01))
             for i, xy in enumerate(places)
@@ -68,18 +66,18 @@ class RouteStick(Task):
                 nearby.remove(route[-2])
             route.append(nearby[draws.integer(0, len(nearby))])
         self.route = [self.discs[i] for i in route]
-        self.turns: list[Turn] = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+        self.directions: list[Direction] = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""
 
         def point(i: int) -> Callable[[], Place | None]:
             def place() -> Place | None:
-                move = len(self.turns) - len(self.progress.to_come)
-                if not 0 <= move < len(self.turns):  # in the video, or at the end
+                move = len(self.directions) - len(self.progress.to_come)
+                if not 0 <= move < len(self.directions):  # in the video, or at the end
                     return None
                 start, end = (disc.position for disc in self.route[move : move + 2])
-                return on_table(arc(start, end, self.turns[move])[i])
+                return on_table(arc(start, end, self.directions[move])[i])
 
             return place
 
@@ -94,7 +92,7 @@ class RouteStick(Task):
     def after_step(self, k: int) -> None:
         tcp = self.tcp_pose.p
         for mark, disc in zip(self.marks, self.discs, strict=True):
-            mark.update(k, over(tcp, disc, VISIT, VISIT_HEIGHT))
+            mark.update(k, over(tcp, disc, REACH_RADIUS, REACH_HEIGHT))
         self._dots.update(k)
 
     def failure(self) -> bool:
@@ -104,7 +102,7 @@ class RouteStick(Task):
         self._way.append(np.asarray(self.tcp_pose.p[:2], np.float64))
         return False
 
-    def _turned(self, previous: Disc, goal: Disc) -> Turn:
+    def _turned(self, previous: Disc, goal: Disc) -> Direction:
         """How the tool went around what lies between two discs: on which side of the chord it was on average."""
         way = np.mean(self._way, axis=0) - previous.position[:2]
         chord = goal.position[:2] - previous.position[:2]
@@ -118,49 +116,49 @@ class RouteStick(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *back_to_start(self, HOME_STEPS), *self._moves(video=False)]
+        return [approach, *self._moves(video=True), *end_stick_video(self, HOME_STEPS), *self._moves(video=False)]
 
     def _moves(self, video: bool) -> list[SubTask]:
-        legs = zip(self.route, self.route[1:], self.turns, strict=False)
-        return [self._move(previous, goal, turn, video) for previous, goal, turn in legs]
+        legs = zip(self.route, self.route[1:], self.directions, strict=False)
+        return [self._move(previous, goal, direction, video) for previous, goal, direction in legs]
 
-    def _move(self, previous: Disc, goal: Disc, turn: Turn, video: bool) -> SubTask:
+    def _move(self, previous: Disc, goal: Disc, direction: Direction, video: bool) -> SubTask:
         others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]
         side = "left" if goal.position[1] > previous.position[1] else "right"
 
         def there() -> bool:
-            return over(self.tcp_pose.p, goal, VISIT, VISIT_HEIGHT)
+            return over(self.tcp_pose.p, goal, REACH_RADIUS, REACH_HEIGHT)
 
         def failed() -> bool:
             astray = any(over(self.tcp_pose.p, disc) for disc in others)
-            return astray or (there() and self._turned(previous, goal) != turn)
+            return astray or (there() and self._turned(previous, goal) != direction)
 
         return SubTask(
-            self._text(side, turn),
+            self._text(side, direction),
             done=there,
-            run=lambda demo: demo.stick_arc(goal, turn),
+            run=lambda demo: demo.stick_arc(goal, direction),
             failed=failed,
-            choice="abcd"[SIDES.index((side, turn))],
+            choice="abcd"[SIDES.index((side, direction))],
             video=video,
             operation=lambda: "how" if there() else "order",
         )
 
     @staticmethod
-    def _text(side: str, turn: Turn) -> str:
-        return f"move to the nearest {side} target by circling around the stick {turn}"
+    def _text(side: str, direction: Direction) -> str:
+        return f"move to the nearest {side} target by circling around the stick {direction}"
 
     def choices(self) -> list[Choice]:
-        return [self._choice(letter, side, turn) for letter, (side, turn) in zip("abcd", SIDES, strict=True)]
+        return [self._choice(letter, side, direction) for letter, (side, direction) in zip("abcd", SIDES, strict=True)]
 
-    def _choice(self, letter: str, side: str, turn: Turn) -> Choice:
-        return Choice(letter, self._text(side, turn), lambda demo, _: self._go(demo, side, turn))
+    def _choice(self, letter: str, side: str, direction: Direction) -> Choice:
+        return Choice(letter, self._text(side, direction), lambda demo, _: self._go(demo, side, direction))
 
-    def _go(self, demo: "Demonstrator", side: str, turn: Turn) -> None:
+    def _go(self, demo: "Demonstrator", side: str, direction: Direction) -> None:
         tcp = self.tcp_pose.p
         here = min(range(len(self.discs)), key=lambda i: distance_xy(self.discs[i].position, tcp))
         there = here + (1 if side == "left" else -1)
         if 0 <= there < len(self.discs):
-            demo.stick_arc(self.discs[there], turn)
+            demo.stick_arc(self.discs[there], direction)
 
     def goals(self) -> list[str]:
         around = "use the stick attached to the robot to navigate around the sticks on the table"

@@ -6,16 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import ordinal
-from mme_vla.envs.scene.cues import Cue, row, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import smoothstep
-from mme_vla.envs.scene.objects import build_button, build_disc, build_moving_cube
-from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, row, smoothstep, tally
+from mme_vla.envs.scene.objects import build_disc, build_moving_cube
+from mme_vla.envs.scene.placement import Draws, draw_button
 from mme_vla.envs.scene.predicates import hovering, pressed
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
@@ -58,11 +55,11 @@ class StopCube(Task):
     def _place(self, k: int) -> None:
         """Put the cube where it is after `k` steps."""
         passes = PASSES + self.turned("count")
-        turn, steps = divmod(min(k, self.interval * passes), self.interval)
-        if turn == passes:
-            turn, steps = passes - 1, self.interval
+        pass_index, steps = divmod(min(k, self.interval * passes), self.interval)
+        if pass_index == passes:
+            pass_index, steps = passes - 1, self.interval
         side = 2 * smoothstep(steps / self.interval) - 1
-        xy = self.target.position[:2] + self._reach * (side if turn % 2 == 0 else -side)
+        xy = self.target.position[:2] + self._reach * (side if pass_index % 2 == 0 else -side)
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
 
     def cues(self) -> list[Cue]:

@@ -1,17 +1,15 @@
 """SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.scene.cues import TALLY_SPACING, Cue, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Mark, build_mark
-from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
+from mme_vla.envs.scene.objects import Cube, Disc, H, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_disc
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, pressed
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import add_cube, pick, press
 
 SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
@@ -61,10 +59,8 @@ class SwingXtimes(Task):
         draws.integer(0, 3)
         self.cubes: list[Cube] = []
         for colour in colours[: CUBES[self.difficulty]]:
-            place = draw_cube(draws, Region((-0.1, 0), 0.25), [self.button, *self.cubes], gap=H)
-            if place is None:
-                raise SceneError(f"SwingXtimes, seed {self.seed}: the {colour} cube finds no place.")
-            self.cubes.append(self.add(build_cube(self, f"cube_{colour}", colour, *place)))
+            avoid = [self.button, *self.cubes]
+            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, Region((-0.1, 0), 0.25), avoid))
         targets: list[Disc] = []
         for y in (-0.2, 0.2):
             avoid = [self.button, *self.cubes, *targets]
@@ -104,16 +100,7 @@ class SwingXtimes(Task):
 
     def subtasks(self) -> list[SubTask]:
         cube, colour = self.cube, self.cube.colour
-        pick = SubTask(
-            f"pick up the {colour} cube",
-            done=lambda: picked_up(self, cube),
-            run=lambda demo: demo.pick(cube),
-            grounded=f"pick up the {colour} cube at <>",
-            targets=[cube],
-            choice="a",
-            pick=True,
-            operation=self._mistaken,
-        )
+        first = pick(self, cube, f"pick up the {colour} cube", pick=True, operation=self._mistaken)
         put_down = SubTask(
             f"put the {colour} cube on the table",
             done=lambda: dropped(self, cube),
@@ -122,18 +109,10 @@ class SwingXtimes(Task):
             choice="c",
             operation=self._mistaken,
         )
-        press = SubTask(
-            "press the button",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <>",
-            targets=[self.button],
-            choice="d",
-            operation=self._mistaken,
-        )
+        last = press(self.button, "press the button", "d", operation=self._mistaken)
         sides = [("right", self.right, self.swings[0]), ("left", self.left, self.swings[1])]
         moves = [self._move(i, *side) for i in range(self.repetitions) for side in sides]
-        return [pick, *moves, put_down, press]
+        return [first, *moves, put_down, last]
 
     def _move(self, i: int, side: str, target: Disc, swings: Swings) -> SubTask:
         return SubTask(

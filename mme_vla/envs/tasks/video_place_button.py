@@ -2,8 +2,8 @@
 
 from typing import ClassVar
 
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Disc
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.video_place import VideoPlace

@@ -2,10 +2,9 @@
 
 from typing import ClassVar
 
-from mme_vla.envs.language import ordinal
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Disc
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.subtasks import SubTask, ordinal
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.video_place import VideoPlace
 
@@ -15,7 +14,7 @@ class VideoPlaceOrder(VideoPlace):
     """The video visits some of the targets in random order; a press of the button comes in between."""
 
     shared_draws = True
-    recovery_drawn_per_episode = True
+    recovery_sampled_per_episode = True
     spot_radius = 0.1
     operation = "order"
     target_counts: ClassVar[dict[str, int]] = {"easy": 4, "medium": 4, "hard": 4}

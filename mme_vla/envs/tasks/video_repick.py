@@ -2,26 +2,29 @@
 
 from typing import TYPE_CHECKING
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.scene.anchors import ANCHOR_HALF, rotated_anchors, swaps_in_turn
-from mme_vla.envs.scene.cues import Cue, row, tally, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
-from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
-from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import SWAP_STEPS, Cue, Swap, row, sequential_swaps, tally, under
+from mme_vla.envs.scene.objects import Cube
+from mme_vla.envs.scene.placement import (
+    ANCHOR_HALF,
+    Draws,
+    Region,
+    draw_button,
+    rotated_anchors,
+)
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, pressed
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import add_cube, end_video, go_home, pick, press, wait
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    pass
 
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
 GO_HOME_STEPS = 20
-SHOWN_RELEASE_Z, RELEASE_Z = 0.03, 0.01
+VIDEO_RELEASE_Z, RELEASE_Z = 0.03, 0.01
 PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
 
 
@@ -31,7 +34,7 @@ class VideoRepick(Task):
 
     shared_draws = True
     latch_failure = True
-    recovery_drawn_per_episode = True
+    recovery_sampled_per_episode = True
     dials = frozenset({"count", "delay"})
 
     def plan(self, draws: Draws) -> None:
@@ -58,10 +61,8 @@ class VideoRepick(Task):
         self.initiators = [self.cube, *(others[i] for i in draws.permutation(2))][: self.swap_count]
 
     def _add_cube(self, draws: Draws, colour: str, region: Region) -> None:
-        place = draw_cube(draws, region, [self.button, *self.cubes], gap=H)
-        if place is None:
-            raise SceneError(f"VideoRepick, seed {self.seed}: cube {len(self.cubes)} finds no place.")
-        self.cubes.append(self.add(build_cube(self, f"cube_{len(self.cubes)}", colour, *place)))
+        name, avoid = f"cube_{len(self.cubes)}", [self.button, *self.cubes]
+        self.cubes.append(add_cube(self, draws, name, colour, region, avoid))
 
     def start_episode(self, draws: Draws) -> None:
         self.swaps: list[Swap] = []
@@ -70,7 +71,7 @@ class VideoRepick(Task):
 
     def before_physics(self, k: int) -> None:
         if self._swaps_due and not self.swaps:
-            self.swaps = swaps_in_turn(self.initiators, self.cubes, start=k)
+            self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
         for swap in self.swaps:
             swap.apply(k)
 
@@ -94,68 +95,32 @@ class VideoRepick(Task):
 
     def _video(self) -> list[SubTask]:
         cube = self.cube
-        pick = SubTask(
-            "pick up the cube",
-            done=lambda: picked_up(self, cube),
-            run=lambda demo: demo.pick(cube),
-            targets=[cube],
-            choice="a",
-            video=True,
-        )
         drop = SubTask(
             "drop the cube on the table",
             done=lambda: dropped(self, cube),
-            run=lambda demo: demo.put_down(SHOWN_RELEASE_Z),
+            run=lambda demo: demo.put_down(VIDEO_RELEASE_Z),
             targets=[cube],
             choice="b",
             video=True,
         )
-        swaps = [
-            SubTask("static", StaticFor(self, SWAP_STEPS), lambda demo: demo.hold(SWAP_STEPS), video=True)
-            for _ in self.initiators
-        ]
+        swaps = [wait(self, SWAP_STEPS) for _ in self.initiators]
         self._swap_stage = swaps[0] if swaps else None
-        rest = GO_HOME_STEPS + self.turned("delay")
-        home = [SubTask("static", StaticFor(self, rest), lambda demo: self._go_home(demo, rest), video=True)]
-        home = home if swaps or self.turned("delay") else []
-        back = SubTask(
-            NO_RECORD,
-            done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
-            run=lambda demo: demo.hard_reset(),
-            video=True,
-        )
-        return [pick, drop, *home, *swaps, back]
-
-    @staticmethod
-    def _go_home(demo: "Demonstrator", steps: int) -> None:
-        demo.go_home()
-        demo.hold(steps)
+        first = pick(self, cube, "pick up the cube", grounded="", video=True)
+        delay = self.turned("delay")
+        home = [go_home(self, GO_HOME_STEPS + delay)] if swaps or delay else []
+        return [first, drop, *home, *swaps, end_video(self)]
 
     def _execution(self) -> list[SubTask]:
-        press = SubTask(
-            "press the button to finish",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <> to finish",
-            failed=lambda: any_picked_up(self, self.cubes),
-            targets=[self.button],
-            choice="c",
-            operation="how many",
-        )
-        return [*(step for i in range(self.repetitions) for step in (self._pick(i), self._put())), press]
+        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
+        steps = [step for i in range(self.repetitions) for step in (self._pick(i), self._put())]
+        return [*steps, press(self.button, "press the button to finish", "c", **stop)]
 
     def _pick(self, i: int) -> SubTask:
-        return SubTask(
-            f"pick up the correct cube for the {ordinal(i)} time",
-            done=lambda: picked_up(self, self.cube),
-            run=lambda demo: demo.pick(self.cube),
-            grounded=f"pick up the correct cube at <> for the {ordinal(i)} time",
-            failed=lambda: self._other_picked_up() or self._pressed_early("pick"),
-            targets=[self.cube],
-            choice="a",
-            pick=True,
-            operation=self._mistaken,
-        )
+        def strayed() -> bool:
+            return self._other_picked_up() or self._pressed_early("pick")
+
+        text = f"pick up the correct cube for the {ordinal(i)} time"
+        return pick(self, self.cube, text, failed=strayed, pick=True, operation=self._mistaken)
 
     def _put(self) -> SubTask:
         return SubTask(

@@ -1,11 +1,8 @@
 """VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import COVER_STEPS, Cover
-from mme_vla.envs.scene.predicates import StaticFor
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.motions import COVER_STEPS, Cover, Cue, under
+from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (
@@ -15,8 +12,9 @@ from mme_vla.envs.tasks.families.containers import (
     container_picks,
     hiding_goal,
 )
+from mme_vla.envs.tasks.families.stages import wait
 
-CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # asked for; in hard episodes as many as fit
+CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # in hard episodes as many as fit
 PICKS = {"easy": 1, "medium": 1, "hard": 2}
 
 
@@ -42,11 +40,9 @@ class VideoUnmask(Task):
         self.cover.apply(k)
 
     def subtasks(self) -> list[SubTask]:
-        watched = COVER_STEPS + self.turned("delay")
-        static = StaticFor(self, watched)
-        wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
-        picks = container_picks(self, wanted, self.containers)
-        return [SubTask("static", static, lambda demo: demo.hold(watched), video=True), *picks]
+        targets = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
+        picks = container_picks(self, targets, self.containers)
+        return [wait(self, COVER_STEPS + self.turned("delay")), *picks]
 
     def choices(self) -> list[Choice]:
         return container_choices(self.containers)

@@ -1,13 +1,16 @@
 """VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick up the right one."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.anchors import rotated_anchors
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.predicates import StaticFor
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.placement import Draws, rotated_anchors
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.containers import container_choices, container_picks, hiding_goal
-from mme_vla.envs.tasks.families.unmask_swap import CONTAINERS, UnmaskSwap
+from mme_vla.envs.tasks.families.containers import (
+    CONTAINERS,
+    UnmaskSwap,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
+from mme_vla.envs.tasks.families.stages import wait
 
 
 @register_task
@@ -20,13 +23,11 @@ class VideoUnmaskSwap(UnmaskSwap):
         self.build_containers(draws, rotated_anchors(draws, CONTAINERS[self.difficulty]))
 
     def subtasks(self) -> list[SubTask]:
-        watched = self.swapped_after + self.turned("delay")
-        static = StaticFor(self, watched)
-        watch = SubTask("static", static, lambda demo: demo.hold(watched), video=True)
-        return [watch, *container_picks(self, self.wanted, self.containers)]
+        watch = wait(self, self.swapped_after + self.turned("delay"))
+        return [watch, *container_picks(self, self.targets, self.containers)]
 
     def choices(self) -> list[Choice]:
         return container_choices(self.containers)
 
     def goals(self) -> list[str]:
-        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.wanted])}"]
+        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"]

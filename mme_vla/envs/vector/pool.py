@@ -1,4 +1,4 @@
-"""Many environments at once, each in a process of its own; a policy batches whichever are ready.
+"""Many environments at once, each in its own process; a policy batches those that are ready.
 
     with make_vec_env("PickXtimes", episodes=range(50), workers=8) as envs:
         for worker in range(envs.workers):
@@ -8,7 +8,7 @@
                 ...  # reply.job, reply.observation, reply.info; then
                 envs.send(reply.worker, action)  # or, when reply.done: envs.start_next(reply.worker)
 
-Processes inherit nothing of the script that makes one (`processes.py`), which therefore keeps its work under
+Processes inherit nothing of the script that makes one (`worker.py`), which therefore keeps its work under
 `if __name__ == "__main__":`.
 """
 
@@ -25,10 +25,57 @@ from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs import metadata
 from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
-from mme_vla.envs.vector.jobs import Job, Reply
-from mme_vla.envs.vector.processes import begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError
-from mme_vla.files.parents import signals_held
+from mme_vla.utils.processes import signals_deferred
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode to run."""
+
+    task: str
+    split: str
+    episode: int
+
+    def __str__(self) -> str:
+        return f"{self.task} {self.split} episode {self.episode}"
+
+
+@dataclass
+class Reply:
+    """The result of one worker: of a reset (`reward` is None) or of a step."""
+
+    worker: int
+    job: Job
+    observation: Any
+    reward: Any
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+    crashed: bool = False
+    """The worker died or hung and was replaced, or the environment raised: no result of the policy."""
+
+    @property
+    def done(self) -> bool:
+        """Whether the episode is over."""
+        return self.terminated or self.truncated or self.info.get("status") == "error"
+
+    @classmethod
+    def of_outcome(cls, worker: int, job: Job, resetting: bool, outcome: tuple) -> "Reply":
+        """From what `reset` or `step` returned."""
+        if resetting:
+            observation, info = outcome
+            return cls(worker, job, observation, None, False, False, info)
+        observation, reward, terminated, truncated, info = outcome
+        return cls(worker, job, observation, reward, bool(terminated), bool(truncated), info)
+
+    @classmethod
+    def of_failure(cls, worker: int, job: Job, resetting: bool, kind: str, message: str) -> "Reply":
+        """Of a command that came to nothing; the message names the episode."""
+        info = {"status": "error", "error_message": f"{job}: {message}", "exception_type": kind}
+        return cls(worker, job, None, None if resetting else 0.0, True, False, info, crashed=True)
+
 
 _CLOSING_SECONDS = 5.0
 _STARTING_SECONDS = 120.0
@@ -62,9 +109,6 @@ class VecEnv:
         factory: makes an environment from `task`, `split`, `episode` and `options`; importable by name.
         options: further arguments of `factory`.
         timeout: seconds after which a command without result counts as hung, and its worker is replaced.
-
-    Raises:
-        UserError: `workers` or `timeout` is not positive.
     """
 
     def __init__(
@@ -107,7 +151,7 @@ class VecEnv:
         return bool(self._lost) or any(worker.running for worker in self._workers)
 
     def start_next(self, worker: int) -> Job | None:
-        """Let a worker begin the next episode that nobody has begun; None when there is none left."""
+        """Let a worker begin the next episode; None when there is none left."""
         self._idle(worker)
         if not self.jobs:
             return None
@@ -120,9 +164,6 @@ class VecEnv:
 
         Args:
             how: arguments of the environment's `reset`.
-
-        Raises:
-            UserError: the environments are closed, or the worker's last reply has not been received.
         """
         state = self._idle(worker)
         state.job, state.resetting = job, True
@@ -130,11 +171,7 @@ class VecEnv:
         self._command(worker, protocol.RESET, arguments, how)
 
     def send(self, worker: int, action: Any) -> None:
-        """Let a worker perform an action; returns at once.
-
-        Raises:
-            UserError: the environments are closed, the worker runs no episode, or its last reply has not been received.
-        """
+        """Let a worker perform an action; returns at once."""
         state = self._idle(worker)
         if state.job is None:
             raise UserError(f"Worker {worker} runs no episode; call start() or start_next() first.")
@@ -145,16 +182,13 @@ class VecEnv:
         """Wait until at least one worker is ready, and take the replies of all that are.
 
         A worker that died or hangs, or whose renderer failed, is replaced, and reported by a reply with `crashed` and
-        the status `error`; the others go on.
+        the status `error`; the others continue.
 
         Args:
             timeout: seconds to wait at most; None waits as long as commands may take.
 
         Returns:
             Replies in the order of the workers; empty when the time is up or nothing is under way.
-
-        Raises:
-            UserError: the environments are closed.
         """
         self._require_open()
         until = time.monotonic() + (float("inf") if timeout is None else timeout)
@@ -173,7 +207,7 @@ class VecEnv:
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
-                # A worker that waits to hand over a piece takes this for the answer, and then finds the pipe closed.
+                # A worker that waits to send a piece takes this for the acknowledgement, then the pipe is closed.
                 state.connection.close()
             except OSError:
                 pass  # it is gone already
@@ -196,7 +230,7 @@ class VecEnv:
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
         work = (imported_plugins(), there, block, self._factory, self._options)
         process = self._context.Process(target=begin, args=(settings(), _work, *work), daemon=True)
-        with signals_held():
+        with signals_deferred():
             process.start()
         there.close()
         return _Worker(process, here, block)
@@ -222,14 +256,13 @@ class VecEnv:
     def _poll(self, index: int, state: _Worker) -> Reply | None:
         """Take what a worker has sent; its reply if that is complete."""
         try:
-            # A long video comes in many pieces, each sent when the last was taken: a caller that looks in rarely would
-            # hold it up, so the next one is waited for.
+            # A long video comes in many pieces, each sent when the last was taken; wait for the next one.
             while state.connection.poll(_NEXT_PIECE_SECONDS if state.arrays else 0):
                 kind, *content = protocol.receive(state.connection)
                 if kind == protocol.PIECE:
                     state.arrays += protocol.read(state.block, content[0])
                     state.deadline = max(state.deadline, time.monotonic() + self.timeout)
-                    protocol.send(state.connection, protocol.GO_ON)
+                    protocol.send(state.connection, protocol.CONTINUE)
                 elif kind == protocol.RESULT:
                     state.running = False
                     return Reply.of_outcome(
@@ -247,11 +280,10 @@ class VecEnv:
         return None
 
     def _crashed(self, index: int, what: str) -> Reply:
-        """Replace a worker that ended or hangs."""
         return self._replace(index, "WorkerCrash", f"the worker process {what}")
 
     def _replace(self, index: int, kind: str, message: str) -> Reply:
-        """Put a new process in a worker's place; the reply that reports what became of the old one's command."""
+        """Start a new process for a worker; the reply reports the failure of its command."""
         old = self._workers[index]
         old.connection.close()
         protocol.end(old.process)
@@ -269,7 +301,6 @@ class VecEnv:
 
 
 def _work(plugins: Sequence[str], *arguments: Any) -> None:
-    """A worker process: first what the user's own tasks are registered by, then its commands."""
     import_plugins(plugins)
     protocol.serve(*arguments)
 

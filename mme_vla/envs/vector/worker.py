@@ -1,16 +1,50 @@
-"""One worker process of a `VecEnv`: builds environments, steps them, and hands frames over through shared memory."""
+"""Processes that simulate: how they start, and the worker of a `VecEnv`.
 
+They start quickly and inherit only the settings of the process that starts them. A worker builds environments, steps
+them, and sends frames through shared memory.
+"""
+
+import gc
+import multiprocessing
 import os
 import pickle
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mme_vla.envs.rendering import renderer_works
-from mme_vla.files.parents import end_with_parent
+from mme_vla.utils.processes import end_with_parent
+
+PRELOADED = ["mme_vla.envs.task"]
+"""Modules that simulating processes import before they begin; fixed when the first of them is started."""
+
+
+def simulating_processes() -> Any:
+    """The context of `multiprocessing` in which processes that simulate are started.
+
+    They are forked from one process that has only imported the simulator and holds no GPU and no renderer, which saves
+    each of them 5 s of CPU time. Its environment variables may be out of date, so `begin` renews them.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    return context
+
+
+def settings() -> dict[str, str]:
+    """The environment variables that a process is to begin with."""
+    return dict(os.environ)
+
+
+def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: Any) -> Any:
+    """Take the environment variables of the process that started this one, then do its work."""
+    gc.freeze()  # what a collection does not walk through stays shared between the processes
+    os.environ.clear()
+    os.environ.update(variables)
+    return work(*arguments)
+
 
 LARGE = 4096
 """Arrays of at least this many bytes go through shared memory; everything else is pickled."""
@@ -18,23 +52,23 @@ FRAMES_PER_BLOCK = 8
 BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 """Shared memory of one worker: long videos are handed over in pieces of this size."""
 
-# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any answer. RESULT: the
+# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any reply. RESULT: the
 # outcome of a command. FAILURE: the command raised. LOST: it raised, and the process is of no further use.
 PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
-RESET, STEP, CLOSE, GO_ON = "reset", "step", "close", "go on"
+RESET, STEP, CLOSE, CONTINUE = "reset", "step", "close", "continue"
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Stands in a message for an array that came through shared memory: the n-th of the message."""
+    """Replaces an array of a message that came through shared memory: the n-th of the message."""
 
     index: int
 
 
 @dataclass(frozen=True)
 class Slot:
-    """Where one array lies in the block."""
+    """Position of one array in the block."""
 
     offset: int
     shape: tuple[int, ...]
@@ -60,7 +94,7 @@ def read(block: Any, slots: list[Slot]) -> list[np.ndarray]:
 
 
 def restore(value: Any, arrays: list[np.ndarray]) -> Any:
-    """Put the arrays back where `Placed` stands for them."""
+    """Put the arrays back in place of `Placed`."""
     if isinstance(value, Placed):
         return arrays[value.index]
     if isinstance(value, dict):
@@ -71,7 +105,7 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
 
 
 def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
-    """Run commands until told to close, until the other side is gone, or until the renderer has failed."""
+    """Run commands until `CLOSE`, until the connection ends, or until the renderer has failed."""
     end_with_parent()
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
     if "torch" in sys.modules:
@@ -153,7 +187,7 @@ def last_words(process: Any) -> str:
 
 
 def end(process: Any) -> None:
-    """Stop a process, by force if need be, and forget it."""
+    """Stop a process, by force if need be."""
     if process.is_alive():
         process.terminate()
         process.join(1.0)

@@ -17,11 +17,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.errors import UserError
-from mme_vla.evaluation.analyses.meta_shapes import RememberedShapes
-from mme_vla.evaluation.results.cost_table import REPLAN, ModelCost
+from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
+from mme_vla.policy.capabilities import CountsCost
 
 
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
@@ -29,12 +29,10 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
 
     Args:
         backbone: a file of `configs/backbone`; by default the one that is the model's full size.
-
-    Raises:
-        UserError: an unknown model, a budget for a model without memory, or a PyTorch that does not count attention.
     """
     _check_attention_is_counted()
     policy = on_meta(model, budget, backbone)
+    assert isinstance(policy, CountsCost)
     batch, memory = policy.full_batch("meta"), policy.memory
     return ModelCost(
         model=model,
@@ -50,17 +48,13 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
 
 def flops(work: Callable[[], object]) -> int:
     """FLOPs of a call, forward only."""
-    with torch.no_grad(), RememberedShapes(), FlopCounterMode(display=False) as counter:
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops()
 
 
 def on_meta(model: str, budget: int | None = None, backbone: str | None = None) -> Policy:
-    """A model on the meta device.
-
-    Raises:
-        UserError: an unknown model, or a budget for a model without memory.
-    """
+    """A model on the meta device."""
     if backbone is None:
         backbone = str(compose("policy", [f"model={model}"]).full_size)
     policy = build_policy(model, backbone=backbone, device="meta")
@@ -79,9 +73,9 @@ def all_models() -> list[str]:
 def _check_attention_is_counted() -> None:
     q, k = torch.empty(1, 8, 20, 32, device="meta"), torch.empty(1, 8, 50, 32, device="meta")
     mask = torch.zeros(1, 1, 20, 50, device="meta")
-    found = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
-    if found != 2 * (2 * 8 * 20 * 50 * 32):
-        raise UserError(f"This PyTorch ({torch.__version__}) counts {found} FLOPs for an attention of 1,024,000.")
+    counted = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
+    if counted != 2 * (2 * 8 * 20 * 50 * 32):
+        raise UserError(f"This PyTorch ({torch.__version__}) counts {counted} FLOPs for an attention of 1,024,000.")
 
 
 def _streamed(policy: Policy, batch: Any) -> int | None:
@@ -94,7 +88,7 @@ def _streamed(policy: Policy, batch: Any) -> int | None:
 
 
 def _frames(policy: Policy) -> int:
-    if policy.memory is None:
+    if policy.memory is None or not isinstance(policy, CountsCost):
         return 0
-    wanted = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
-    return wanted * flops(policy.see_empty_frame)
+    n_encoded = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
+    return n_encoded * flops(policy.warm_up_vision)

@@ -1,4 +1,4 @@
-"""Episodes for the Rerun viewer: pictures, numbers and words over the steps, in one `.rrd` file."""
+"""Episodes for the Rerun viewer: images, numbers and texts over the steps, in one `.rrd` file."""
 
 from pathlib import Path
 from types import TracebackType
@@ -20,11 +20,7 @@ class RerunLog:
     """
 
     def __init__(self, path: Path) -> None:
-        """Begin a file, replacing one of that name.
-
-        Raises:
-            UserError: Rerun is not installed, or `path` has another suffix.
-        """
+        """Begin a file, replacing one of that name."""
         try:
             import rerun
         except ImportError:
@@ -42,9 +38,9 @@ class RerunLog:
         self._episode = episode
         self._stream.set_time("step", sequence=step)
 
-    def picture(self, name: str, picture: np.ndarray | Image.Image) -> None:
-        """Log a picture [H, W, 3] uint8."""
-        image = self._rerun.Image(np.asarray(picture))
+    def log_image(self, name: str, pixels: np.ndarray | Image.Image) -> None:
+        """Log an image [H, W, 3] uint8."""
+        image = self._rerun.Image(np.asarray(pixels))
         self._log(name, image.compress(jpeg_quality=_JPEG_QUALITY))
 
     def number(self, name: str, value: float) -> None:
@@ -56,10 +52,10 @@ class RerunLog:
         self._log(name, self._rerun.TextDocument(text))
 
     def views(self, source: EpisodeSource, episode: int, step: int) -> None:
-        """Go to a step of a recorded episode, and log its pictures and words."""
+        """Go to a step of a recorded episode, and log its images and texts."""
         self.at(episode, step)
         for view in source.robot.camera_names:
-            self.picture(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
+            self.log_image(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
         self.words("goal", source.goal(episode))
         for kind, text in source.subgoals(episode, step).items():
             self.words(kind, text)

@@ -4,9 +4,12 @@ Nothing incomplete is averaged: a run enters a figure only if it has every episo
 says how many of its episodes there are.
 """
 
+import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,12 +17,101 @@ from mme_vla.envs.metadata import FURTHER_SPLITS
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.intervals import Interval, bootstrap, mean_std, task_interval, wilson
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
-from mme_vla.evaluation.results.scopes import Protocol, Scope, scopes, tasks_of
-from mme_vla.evaluation.suites import DIFFICULTIES, MAX_STEPS, PAPER_ORDER, TASK_FACTS
+from mme_vla.evaluation.results.scopes import (
+    DIFFICULTIES,
+    MAX_STEPS,
+    PAPER_ORDER,
+    TASK_FACTS,
+    Protocol,
+    Scope,
+    scopes,
+    tasks_of,
+)
 
-USUAL_BUDGET = 512
+Outcomes = np.ndarray
+"""Successes [episodes, runs]: every run on the same episodes."""
+
+
+class Interval(NamedTuple):
+    """A confidence interval."""
+
+    low: float
+    high: float
+
+
+def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
+    """Mean and sample standard deviation (divisor n − 1), as the released aggregation; one value has none."""
+    if not values:
+        raise ValueError("mean_std() needs at least one value.")
+    array = np.asarray(values, np.float64)
+    return float(array.mean()), float(array.std(ddof=1)) if len(array) > 1 else None
+
+
+def wilson(rate: float, trials: float, confidence: float = 0.95) -> Interval:
+    """Wilson's score interval of a proportion; `trials` may be an effective number."""
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    centre = (rate + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z / (1 + z * z / trials) * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+    return Interval(max(0.0, centre - half), min(1.0, centre + half))
+
+
+def effective_trials(outcomes: Outcomes) -> float:
+    """How many independent trials the repeats of the same episodes are worth.
+
+    Runs of one episode share its scene, so they are not independent: p(1−p) over the variance of the mean that the
+    differences between episodes show, never less than the episodes and never more than all trials.
+    """
+    episodes, runs = outcomes.shape
+    p = outcomes.mean()
+    if runs == 1 or episodes == 1:
+        return float(episodes)
+    variance = outcomes.mean(1).var(ddof=1) / episodes
+    worth = p * (1 - p) / variance if variance > 0 else (0.0 if p in (0, 1) else math.inf)
+    return float(np.clip(worth, episodes, episodes * runs))
+
+
+def task_interval(outcomes: Outcomes, confidence: float = 0.95) -> Interval:
+    """Wilson's interval of one task, for the effective number of trials of all its runs."""
+    return wilson(float(outcomes.mean()), effective_trials(outcomes), confidence)
+
+
+def bootstrap(
+    tasks: Mapping[str, np.ndarray], confidence: float = 0.95, samples: int = 10_000, seed: int = 0
+) -> Interval:
+    """Percentile interval of a mean over tasks, drawing episodes anew within each task.
+
+    Args:
+        tasks: for each task a number per episode [episodes], already averaged over the runs: an episode is sampled with
+            all of them.
+    """
+    rng = np.random.default_rng(seed)
+    means = np.zeros(samples)
+    for values in tasks.values():
+        means += values[rng.integers(0, len(values), (samples, len(values)))].mean(1)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(means / len(tasks), [tail, 1 - tail])
+    return Interval(float(low), float(high))
+
+
+def sign_test(first: int, second: int) -> float:
+    """Exact two-sided p that as many of the differing pairs favour one side; on pairs of runs, McNemar's test."""
+    n = first + second
+    tail = sum(math.comb(n, k) for k in range(min(first, second) + 1))
+    return min(1.0, 2 * tail / 2**n)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's correction for several comparisons, in the order given."""
+    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
+    corrected, highest = [0.0] * len(p_values), 0.0
+    for rank, i in enumerate(order):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[i]))
+        corrected[i] = highest
+    return corrected
+
+
+DEFAULT_BUDGET = 512
 
 
 @dataclass(frozen=True)
@@ -112,11 +204,7 @@ class Results:
     notes: list[str]
 
     def method(self, label: str) -> Method:
-        """Find a method.
-
-        Raises:
-            UserError: there is none of this label.
-        """
+        """Find a method."""
         for method in self.methods:
             if method.label == label:
                 return method
@@ -135,9 +223,6 @@ def aggregate(
         records: of any number of runs; they are merged here. protocol: its tasks are `tasks_of(records)` by default.
         split: only these; needed if there are several.
         conflicts: see `merge`.
-
-    Raises:
-        UserError: nothing to average, an unknown task, several splits, or records that contradict each other.
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))
@@ -149,14 +234,14 @@ def aggregate(
     splits = sorted({record.split for record in merged})
     if split is None and len(splits) > 1:
         raise UserError(f"These are results of several splits ({', '.join(splits)}): choose one with --split.")
-    chosen = [r for r in merged if split in (None, r.split)]
-    if not chosen:
+    selected = [r for r in merged if split in (None, r.split)]
+    if not selected:
         raise UserError(f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}.")
-    inside = [r for r in chosen if protocol.expects(r.key)]
+    inside = [r for r in selected if protocol.expects(r.key)]
     counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
     if not counted:
         raise UserError(
-            f"None of the {len(chosen)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
+            f"None of the {len(selected)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
         )
     _check_environments(counted)
     groups: dict[tuple[str, str | None, int | None, str | None], list[Run]] = {}
@@ -166,10 +251,10 @@ def aggregate(
     methods = [_method(*group, runs, protocol) for group, runs in groups.items()]
     repeats = repeated_episodes(records)
     for method in methods:
-        found = [repeats[run.key] for run in method.runs if run.key in repeats]
-        method.repeated, method.flipped = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
+        counts = [repeats[run.key] for run in method.runs if run.key in repeats]
+        method.repeated, method.flipped = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     apart = _tell_apart(methods)
-    return Results(methods, protocol, [*apart, *_notes(methods, protocol, len(chosen) - len(inside))])
+    return Results(methods, protocol, [*apart, *_notes(methods, protocol, len(selected) - len(inside))])
 
 
 def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
@@ -179,10 +264,10 @@ def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[in
         if record.outcome != "error":
             outcomes.setdefault((record.run, record.key), []).append(record.outcome)
     counts: dict[RunKey, tuple[int, int]] = {}
-    for (run, _), found in outcomes.items():
-        if len(found) > 1:
+    for (run, _), results in outcomes.items():
+        if len(results) > 1:
             repeated, flipped = counts.get(run, (0, 0))
-            counts[run] = repeated + 1, flipped + (len(set(found)) > 1)
+            counts[run] = repeated + 1, flipped + (len(set(results)) > 1)
     return counts
 
 
@@ -204,7 +289,7 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
 def _method(
     model: str, subgoal: str | None, budget: int | None, composition: str | None, runs: list[Run], protocol: Protocol
 ) -> Method:
-    papers = budget in (None, USUAL_BUDGET) and all(run.key.split not in FURTHER_SPLITS for run in runs)
+    papers = budget in (None, DEFAULT_BUDGET) and all(run.key.split not in FURTHER_SPLITS for run in runs)
     known = paper.paper_method(model, subgoal) if papers else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
@@ -215,12 +300,12 @@ def _method(
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
     difficulties = {key: record.difficulty for run in runs for key, record in run.records.items()}
-    whole = {task for task in protocol.averaged for run in runs if run.successes(task) is not None}
+    complete_tasks = {task for task in protocol.averaged for run in runs if run.successes(task) is not None}
     for level in DIFFICULTIES:
-        seen = {key.task for key, of in difficulties.items() if of == level} & set(protocol.averaged)
+        level_tasks = {key.task for key, of in difficulties.items() if of == level} & set(protocol.averaged)
         # A task without the level is left out; one that is not whole yet may have it, and keeps the figure incomplete.
-        tasks = tuple(task for task in protocol.averaged if task in seen or task not in whole)
-        if seen:
+        tasks = tuple(task for task in protocol.averaged if task in level_tasks or task not in complete_tasks)
+        if level_tasks:
             figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
@@ -245,17 +330,17 @@ def _figure(
 ) -> Figure:
     """A figure over whole tasks, from the runs that have all of them."""
     per_run = [[pick(run, task) for task in tasks] for run in runs]
-    whole = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
+    complete = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
     done = [record for run in runs for key, record in run.records.items() if key.task in tasks]
     counts = {
-        "runs": len(runs), "complete": len(whole), "done": len(done),
+        "runs": len(runs), "complete": len(complete), "done": len(done),
         "expected": len(runs) * len(tasks) * protocol.episodes,
     }  # fmt: skip
-    if not whole:
+    if not complete:
         partial = 100 * sum(record.success for record in done) / len(done) if done else None
         return Figure(None, None, None, **counts, partial=partial, paper=reported)
-    matrices = [np.array([run[i] for run in whole], np.float64).T for i in range(len(tasks))]  # episodes × runs
-    mean, std = mean_std([float(np.mean([matrix[:, r].mean() for matrix in matrices])) for r in range(len(whole))])
+    matrices = [np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))]  # episodes × runs
+    mean, std = mean_std([float(np.mean([matrix[:, r].mean() for matrix in matrices])) for r in range(len(complete))])
     if len(tasks) == 1:
         interval = task_interval(matrices[0], protocol.confidence)
     else:
@@ -310,8 +395,8 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             )
         limits = {record.max_steps for run in method.runs for record in run.records.values()}
         if method.paper and limits != {MAX_STEPS}:
-            given = ", ".join(map(str, sorted(limits)))
-            notes.append(f"{method.label} ran with a limit of {given} steps; the paper's is {MAX_STEPS}.")
+            limit_text = ", ".join(map(str, sorted(limits)))
+            notes.append(f"{method.label} ran with a limit of {limit_text} steps; the paper's is {MAX_STEPS}.")
     for split in sorted({run.key.split for method in methods for run in method.runs} & {*FURTHER_SPLITS}):
         notes.append(f"Split {split!r}: scenes beyond the benchmark's own; figures of it are none of the benchmark's.")
     if outside:

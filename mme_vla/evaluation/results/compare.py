@@ -7,8 +7,7 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeKey
-from mme_vla.evaluation.results.aggregate import Method
-from mme_vla.evaluation.results.intervals import Interval, bootstrap, holm, sign_test
+from mme_vla.evaluation.results.aggregate import Interval, Method, bootstrap, holm, sign_test
 from mme_vla.evaluation.results.scopes import Protocol, scopes
 
 
@@ -45,10 +44,10 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """One sentence."""
-        said = self._judgement
+        text = self._judgement
         if self.repeated:
-            said += f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
-        return said
+            text += f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
+        return text
 
     @property
     def _judgement(self) -> str:
@@ -65,11 +64,7 @@ def show_p(p: float) -> str:
 
 
 def compare_all(pairs: Sequence[tuple[Method, Method]], protocol: Protocol) -> list[Comparison]:
-    """Compare pairs of methods, with p values corrected for their number.
-
-    Raises:
-        UserError: a pair has no episode in common, or is one method twice.
-    """
+    """Compare pairs of methods, with p values corrected for their number."""
     made = [compare(first, second, protocol) for first, second in pairs]
     corrected = holm([comparison.p for comparison in made])
     level = 1 - protocol.confidence
@@ -82,11 +77,7 @@ def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
 
 
 def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
-    """Compare two methods.
-
-    Raises:
-        UserError: they have no episode in common, or are one and the same.
-    """
+    """Compare two methods."""
     if first is second:
         raise UserError(f"{first.label} cannot be compared with itself; name two methods.")
     rates = [_rates(method) for method in (first, second)]

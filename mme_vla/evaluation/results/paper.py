@@ -1,12 +1,18 @@
-"""The paper's numbers, to put beside one's own."""
+"""The paper's numbers, to put beside others, and synthetic records with its success rates."""
 
 import csv
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.evaluation.suites import PAPER_ORDER, TASK_FACTS
+from mme_vla.evaluation.records import EpisodeRecord, Seconds
+from mme_vla.evaluation.results.scopes import MAX_STEPS, PAPER_ORDER, PAPER_SEEDS, TASK_FACTS
 
 FOLDER = Path(__file__).resolve().parents[2] / "assets" / "paper"
 
@@ -33,11 +39,7 @@ class PaperResult(NamedTuple):
 
 
 def paper_table(name: str) -> list[dict[str, str]]:
-    """Rows of one of the shipped files, by column.
-
-    Raises:
-        UserError: there is no such table.
-    """
+    """Rows of one of the shipped files, by column."""
     path = FOLDER / f"{name}.csv"
     if not path.is_file():
         raise UserError(f"No table {name!r} of the paper. {did_you_mean(name, [f.stem for f in FOLDER.glob('*.csv')])}")
@@ -64,11 +66,7 @@ def paper_method(model: str, subgoal: str | None = None) -> PaperMethod | None:
 
 @cache
 def per_task(method: str) -> dict[str, PaperResult]:
-    """A method's results on the 16 tasks.
-
-    Raises:
-        UserError: the paper has no such method.
-    """
+    """A method's results on the 16 tasks."""
     rows = {
         row["task"]: PaperResult(float(row["success_mean"]), float(row["success_std"]))
         for row in paper_table("per_task")
@@ -98,5 +96,102 @@ def group_mean(method: str, group: str) -> PaperResult:
 def _mean(method: str, tasks: list[str] | tuple[str, ...]) -> float:
     results = per_task(method)
     if not tasks:
-        raise UserError("No task of this name: see SUITES and GROUPS of mme_vla.evaluation.suites.")
+        raise UserError("No task of this name: see SUITES and GROUPS of mme_vla.evaluation.results.scopes.")
     return sum(results[task].mean for task in tasks) / len(tasks)
+
+
+REPLAN = 16
+"""Frames that pass between two chunks of an episode."""
+_COUNTED = Path(__file__).resolve().parents[2] / "assets" / "cost.csv"
+
+
+@dataclass(frozen=True)
+class ModelCost:
+    """One model's cost; all but `prompt` (tokens) and `parameters` in FLOPs.
+
+    forward: the loss of one training sample. chunk: memory, prefix and ten Euler steps. memory: of these, encoding the
+    memory tokens from scratch. streamed: instead, a recurrent memory's update by one frame (None for others). frames:
+    the vision tower on those of `REPLAN` passing frames that the memory stores.
+    """
+
+    model: str
+    prompt: int
+    parameters: int
+    forward: int
+    chunk: int
+    memory: int
+    streamed: int | None
+    frames: int
+
+
+@cache
+def counted() -> dict[str, ModelCost]:
+    """The shipped counts of every model at full size, made by `python -m mme_vla.analyse cost`."""
+    with _COUNTED.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    numbers = [{key: int(text) if text else None for key, text in row.items() if key != "model"} for row in rows]
+    return {row["model"]: ModelCost(row["model"], **of) for row, of in zip(rows, numbers, strict=True)}  # type: ignore
+
+
+def chunk_flops() -> dict[str, float]:
+    """FLOPs of a sampled chunk at full size, by model."""
+    return {model: float(cost.chunk) for model, cost in counted().items()}
+
+
+def write_costs(costs: list[ModelCost], path: Path) -> None:
+    """Write counts as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [member.name for member in fields(ModelCost)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(cost) for cost in costs)
+
+
+CHECKPOINTS = (60_000, 70_000, 79_999)
+_LEVELS = ("easy", "easy", "medium", "hard")
+_EASE = {"easy": 0.8, "medium": 0.0, "hard": -1.0}
+
+
+def demo_records(
+    methods: Sequence[tuple[str, str | None]],
+    checkpoints: Sequence[int] = CHECKPOINTS,
+    seeds: Sequence[int] = PAPER_SEEDS,
+    episodes: int = 50,
+) -> list[EpisodeRecord]:
+    """Draw outcomes at random: right on average for the paper's per-task rates, and meaningless otherwise.
+
+    An episode is as hard for every method, so that runs agree as real ones do.
+
+    Args:
+        methods: (model, subgoal predictor) pairs that the paper reports.
+    """
+    records = []
+    for model, subgoal in methods:
+        known = paper_method(model, subgoal)
+        if known is None:
+            raise UserError(f"The paper does not report {model} with subgoals from {subgoal}.")
+        for task, result in per_task(known.name).items():
+            number = PAPER_ORDER.index(task)
+            levels = [_LEVELS[e % 4] for e in range(episodes)]
+            ease = np.random.default_rng([number]).normal(scale=1.5, size=episodes) + [_EASE[level] for level in levels]
+            chances = _chances(ease, result.mean / 100)
+            for checkpoint in checkpoints:
+                for seed in seeds:
+                    rng = np.random.default_rng([zlib.crc32(known.name.encode()), number, checkpoint, seed])
+                    for episode, won in enumerate(rng.random(episodes) < chances):
+                        steps = int(TASK_FACTS[task].steps * rng.uniform(0.7, 1.1)) if won else MAX_STEPS
+                        place = (model, checkpoint, seed, task, episode, 1000 * number + episode, levels[episode])
+                        ended = ("success" if won else "timeout", steps)
+                        time = Seconds(0.02 * steps, 0.01 * steps, 0.03 * steps)
+                        records.append(EpisodeRecord(*place, *ended, time, subgoal=subgoal, extra={"made_up": True}))
+    return records
+
+
+def _chances(ease: np.ndarray, rate: float) -> np.ndarray:
+    """Each episode's chance: a logistic of its ease, moved until the mean is `rate`."""
+    low, high = -30.0, 30.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        chances = 1 / (1 + np.exp(-(ease + middle)))
+        low, high = (middle, high) if chances.mean() < rate else (low, middle)
+    return chances

@@ -1,4 +1,4 @@
-"""The report's figures, as SVG text that stands in a page by itself."""
+"""The report's figures, as SVG text that is in a page by itself."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
-from mme_vla.evaluation.suites import OWN, SUITES, task_facts
+from mme_vla.evaluation.results.scopes import OWN, SUITES, task_facts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,14 +42,14 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
     ]
     having = having[:MOST_BARS]
     names = list(dict.fromkeys(name for _, method in having for name in method.figures[kind]))
-    with picture((10.4, 3.8) if wide else (5.6, 3.6)) as (canvas, (axes,)):
+    with figure((10.4, 3.8) if wide else (5.6, 3.6)) as (canvas, (axes,)):
         width, lines = 0.8 / max(len(having), 1), []
         for place, (i, method) in enumerate(having):
             shift = (place - (len(having) - 1) / 2) * width
             figures = [(j + shift, method.figures[kind][name]) for j, name in enumerate(names)]
-            whole = [(at, f.mean, f.interval) for at, f in figures if f.mean is not None and f.interval is not None]
-            xs, heights = [at for at, *_ in whole], [mean for _, mean, _ in whole]
-            gaps = [[mean - of.low for _, mean, of in whole], [of.high - mean for _, mean, of in whole]]
+            complete = [(at, f.mean, f.interval) for at, f in figures if f.mean is not None and f.interval is not None]
+            xs, heights = [at for at, *_ in complete], [mean for _, mean, _ in complete]
+            gaps = [[mean - of.low for _, mean, of in complete], [of.high - mean for _, mean, of in complete]]
             axes.bar(xs, heights, 0.88 * width, color=_colour(i), label=method.label)
             axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
             lines += [(at, f.paper.mean) for at, f in figures if f.paper is not None]
@@ -74,7 +74,7 @@ def heat_map(results: Results) -> str:
             reported = [method.figures["task"][task].paper for task in tasks]
             rows.append(("paper", [None if result is None else result.mean for result in reported]))
     values = np.array([[np.nan if v is None else v for v in row] for _, row in rows], float)
-    with picture((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
+    with figure((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
         axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto")
         for i, j in np.ndindex(values.shape):
             known = not np.isnan(values[i, j])
@@ -106,7 +106,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
     Args:
         flops: of a sampled chunk at full size, by model.
     """
-    with picture((5.6, 3.9)) as (canvas, (axes,)):
+    with figure((5.6, 3.9)) as (canvas, (axes,)):
         named = set()
         for known in paper.paper_methods().values():
             if known.model in flops and known.subgoal != "memer":
@@ -139,20 +139,22 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
         points: as `budget_points` gives them.
     """
     order = list(dict.fromkeys(method.model for method in results.methods))
-    with picture((5.6, 3.9)) as (canvas, (axes,)):
+    with figure((5.6, 3.9)) as (canvas, (axes,)):
         table = paper.paper_table("memory_budget")
         budgets = [int(row["memory_tokens"]) for row in table]
         for marker, model in zip("ov", SWEPT, strict=True):
             values = [float(row[f"{model}_success"]) for row in table]
             colour = _colour(order.index(model)) if model in points else FAINT
             axes.plot(budgets, values, f"--{marker}", color=colour, mfc="white", ms=5, lw=1.1, label=f"{model} (paper)")
-        for model, found in points.items():
-            whole = [(b, f.mean, f.interval) for b, f in found if f.mean is not None and f.interval is not None]
-            gaps = [[mean - of.low for _, mean, of in whole], [of.high - mean for _, mean, of in whole]]
+        for model, model_points in points.items():
+            complete = [
+                (b, f.mean, f.interval) for b, f in model_points if f.mean is not None and f.interval is not None
+            ]
+            gaps = [[mean - of.low for _, mean, of in complete], [of.high - mean for _, mean, of in complete]]
             style = {"color": _colour(order.index(model)), "lw": 1.8, "ms": 6, "capsize": 3, "label": model}
-            axes.errorbar([b for b, *_ in whole], [mean for _, mean, _ in whole], gaps, fmt="-s", **style)  # type: ignore[arg-type]
+            axes.errorbar([b for b, *_ in complete], [mean for _, mean, _ in complete], gaps, fmt="-s", **style)  # type: ignore[arg-type]
         axes.set_xscale("log", base=2)
-        ticks = sorted({*budgets, *(b for found in points.values() for b, _ in found)})
+        ticks = sorted({*budgets, *(b for model_points in points.values() for b, _ in model_points)})
         axes.set_xticks(ticks, [f"{b:,}" for b in ticks])
         axes.minorticks_off()
         axes.set_xlabel("memory tokens")
@@ -162,21 +164,21 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
         return svg(canvas)
 
 
-def budget_points(methods: Sequence[Method], usual: int) -> dict[str, list[tuple[int, Figure]]]:
+def budget_points(methods: Sequence[Method], default: int) -> dict[str, list[tuple[int, Figure]]]:
     """The average at each budget, ascending, of every model with a sweep, or that the paper swept; complete only."""
     points: dict[str, list[tuple[int, Figure]]] = {}
     for method in methods:
         if method.average.mean is not None:
-            points.setdefault(method.model, []).append((method.memory_budget or usual, method.average))
+            points.setdefault(method.model, []).append((method.memory_budget or default, method.average))
     return {
-        model: sorted(found, key=lambda point: point[0])
-        for model, found in points.items()
-        if len({budget for budget, _ in found}) > 1 or model in SWEPT
+        model: sorted(model_points, key=lambda point: point[0])
+        for model, model_points in points.items()
+        if len({budget for budget, _ in model_points}) > 1 or model in SWEPT
     }
 
 
 @contextmanager
-def picture(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canvas, list[Axes]]]":
+def figure(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canvas, list[Axes]]]":
     """A figure of panels under each other, in the report's style for as long as it is entered."""
     import matplotlib
     from matplotlib.figure import Figure as Canvas
@@ -187,7 +189,7 @@ def picture(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canva
 
 
 def svg(canvas: "Canvas") -> str:
-    """The figure as an element that stands in a page."""
+    """The figure as an element that is in a page."""
     out = io.StringIO()
     canvas.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()
@@ -195,7 +197,7 @@ def svg(canvas: "Canvas") -> str:
 
 
 def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
-    """A legend above the panel, clear of what is drawn in it, in so many columns at most."""
+    """A legend above the panel, clear of its content, in so many columns at most."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))  # last, in the bars

@@ -1,40 +1,44 @@
-"""One self-contained HTML page of results: no script, no address, pictures inside."""
+"""Reports: one self-contained HTML page with its images inside, and the training details of a submission."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from html import escape
+from pathlib import Path
+from typing import Any
 
 from mme_vla.evaluation.results import plots
-from mme_vla.evaluation.results.aggregate import USUAL_BUDGET, Results
+from mme_vla.evaluation.results.aggregate import DEFAULT_BUDGET, Method, Results
 from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.results.cost_table import chunk_flops
-from mme_vla.evaluation.results.process_scores import CAPTION, process_tables
+from mme_vla.evaluation.results.curves import CAPTION, process_tables
+from mme_vla.evaluation.results.paper import chunk_flops
 from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
-from mme_vla.evaluation.rollout.subgoal_score import subgoal_tables
+from mme_vla.evaluation.rollout.subgoals import subgoal_tables
+from mme_vla.evaluation.store import RUN_FILE, read_run
+from mme_vla.utils.pages import render
 
-_CSS = """
-:root { --ink: #2b2d42; --faint: #6c7689; --line: #e3e6ec; --accent: #1f6f8b; }
-* { box-sizing: border-box; }
-body { font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: var(--ink); background: #f6f7f9; }
-body { margin: 0; }
-main { max-width: 1120px; margin: 0 auto; padding: 28px 24px 60px; }
-h1 { font-size: 27px; margin: 0 0 2px; } h2 { font-size: 18px; margin: 0 0 10px; }
-.sub { color: var(--faint); margin: 0 0 18px; }
-section { background: white; border: 1px solid var(--line); border-radius: 10px; padding: 18px 22px; margin: 0 0 18px; }
-.two { display: grid; grid-template-columns: 1fr 1fr; gap: 18px; } .two section { margin: 0; }
-.two + section { margin-top: 18px; }
-svg { max-width: 100%; height: auto; display: block; margin: 0 auto; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; font-size: 13.5px; font-variant-numeric: tabular-nums; }
-th { text-align: right; color: var(--faint); font-weight: 600; border-bottom: 2px solid var(--line); padding: 5px 9px; }
-td { text-align: right; padding: 4px 9px; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-tr.strong td { font-weight: 650; } tr.rule td { border-top: 2px solid var(--line); }
-.note { border-left: 4px solid #e07a2f; background: #fff6ee; padding: 8px 14px; margin: 0 0 18px; border-radius: 4px; }
-.note p { margin: 2px 0; } .caption { color: var(--faint); font-size: 13px; margin: 8px 0 0; }
-details { margin: 0 0 10px; } summary { cursor: pointer; font-weight: 600; }
-@media (max-width: 900px) { .two { grid-template-columns: 1fr; } }
-"""
+
+@dataclass(frozen=True)
+class Section:
+    """A box of a page.
+
+    figure: SVG from `plots.svg`. headed: whether tables stand under their titles. folded: tables behind a summary.
+    images: name and WEBP in base64. half: whether it takes half the width, beside another.
+    """
+
+    title: str
+    figure: str = ""
+    tables: Sequence[Table] = ()
+    headed: bool = False
+    caption: str = ""
+    paragraphs: Sequence[str] = ()
+    folded: Sequence[tuple[str, Table]] = ()
+    images: Sequence[tuple[str, str]] = ()
+    half: bool = False
+
+
+def html_page(title: str, sections: Sequence[Section], subtitle: str = "", notes: Sequence[str] = ()) -> str:
+    """One self-contained page of these sections."""
+    return render("page.html", title=title, subtitle=subtitle, notes=notes, sections=sections)
 
 
 def html_report(results: Results, comparisons: Sequence[Comparison], title: str) -> str:
@@ -47,91 +51,128 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     methods, runs = len(results.methods), sum(len(method.runs) for method in results.methods)
     sub = f"{methods} method{'s' * (methods > 1)}, {runs} run{'s' * (runs > 1)} of "
     sub += f"{len(protocol.averaged)} tasks × {protocol.episodes} episodes · {datetime.now(UTC):%Y-%m-%d}"
-    parts = [f"<h1>{escape(title)}</h1><p class=sub>{sub}</p>"]
-    if results.notes:
-        parts.append("<div class=note>" + "".join(f"<p>{escape(note)}</p>" for note in results.notes) + "</div>")
-    parts.append(section("Overview", html_table(overview(results)), overview(results).title + "."))
-    whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper."
-    difficulty = "Mean over tasks of the episodes of a difficulty."
-    parts.append(
-        pair(
-            ("Suites", plots.bars(results, "suite"), whiskers),
-            ("Difficulty", plots.bars(results, "difficulty"), difficulty),
-        )
+    average, whiskers = (
+        overview(results),
+        f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper.",
     )
-    parts.append(section("Functional groups", plots.bars(results, "group", wide=True), whiskers))
-    parts.append(section("Tasks", plots.heat_map(results), "Success rate in percent."))
+    difficulty = "Mean over tasks of the episodes of a difficulty."
     rings = "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames are counted."
-    cost = ("Efficiency", plots.efficiency(results, chunk_flops()), rings)
-    points = plots.budget_points(results.methods, USUAL_BUDGET)
+    points = plots.budget_points(results.methods, DEFAULT_BUDGET)
+    sections = [
+        Section("Overview", tables=[average], caption=f"{average.title}."),
+        Section("Suites", plots.bars(results, "suite"), caption=whiskers, half=True),
+        Section("Difficulty", plots.bars(results, "difficulty"), caption=difficulty, half=True),
+        Section("Functional groups", plots.bars(results, "group", wide=True), caption=whiskers),
+        Section("Tasks", plots.heat_map(results), caption="Success rate in percent."),
+        Section("Efficiency", plots.efficiency(results, chunk_flops()), caption=rings, half=bool(points)),
+    ]
     if points:
         curve = plots.budget_curve(results, points)
-        parts.append(pair(cost, ("Memory budget", curve, "Dashed: the paper's sweep.")))
-    else:
-        parts.append(section(*cost))
+        sections.append(Section("Memory budget", curve, caption="Dashed: the paper's sweep.", half=True))
     if comparisons:
         verdicts = "; ".join(comparison.verdict for comparison in comparisons) + "."
-        parts.append(section("Paired comparison", html_table(comparison_table(comparisons)), verdicts))
-    subgoals = subgoal_tables(results)
-    if subgoals:
+        sections.append(Section("Paired comparison", tables=[comparison_table(comparisons)], caption=verdicts))
+    if subgoals := subgoal_tables(results):
         text = "Words are right when they equal the environment's, points aside; distances are of the points then."
-        parts.append(section("Subgoals", "".join(f"<h3>{escape(t.title)}</h3>{html_table(t)}" for t in subgoals), text))
-    chains = process_tables(results)
-    if chains:
-        text = "".join(f"<h3>{escape(table.title)}</h3>{html_table(table)}" for table in chains)
-        parts.append(section("Where the chain broke", text, CAPTION))
-    details = "".join(
-        f"<details><summary>{escape(method.label)}</summary>{html_table(detail(method, results))}</details>"
-        for method in results.methods
-    )
-    parts.append(section("Every method in full", details))
-    runs_details = f"<details><summary>{runs} runs</summary>{html_table(runs_table(results))}</details>"
-    parts.append(section("Runs", runs_details))
-    parts.append(section("How the numbers are made", _method_text(results)))
-    return document(title, parts)
+        sections.append(Section("Subgoals", tables=subgoals, headed=True, caption=text))
+    if chains := process_tables(results):
+        sections.append(Section("Where the chain broke", tables=chains, headed=True, caption=CAPTION))
+    details = [(method.label, detail(method, results)) for method in results.methods]
+    sections += [
+        Section("Every method in full", folded=details),
+        Section("Runs", folded=[(f"{runs} runs", runs_table(results))]),
+        Section("How the numbers are made", paragraphs=_method_text(results)),
+    ]
+    return html_page(title, sections, sub, results.notes)
 
 
-def document(title: str, parts: Sequence[str]) -> str:
-    """A page of these parts, in the report's style."""
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{_CSS}</style></head>\n'
-        f"<body><main>{''.join(parts)}</main></body></html>\n"
-    )
-
-
-def _method_text(results: Results) -> str:
+def _method_text(results: Results) -> list[str]:
     protocol = results.protocol
     errors = "count as failures" if protocol.errors == "failure" else "count as not run"
-    return (
-        "<p>Means and sample standard deviations (n − 1) are over runs, one run being one checkpoint with one model "
-        "seed; suites, groups and the average are means over their tasks within a run first. Only runs that have every "
-        f"episode of a figure enter it. Episodes that ended in an error {errors}.</p>"
-        f"<p>Intervals ({100 * protocol.confidence:g} %): per task Wilson's, for the number of independent trials that "
+    return [
+        "Means and sample standard deviations (n − 1) are over runs, one run being one checkpoint with one model seed; "
+        "suites, groups and the average are means over their tasks within a run first. Only runs that have every "
+        f"episode of a figure enter it. Episodes that ended in an error {errors}.",
+        f"Intervals ({100 * protocol.confidence:g} %): per task Wilson's, for the number of independent trials that "
         f"all runs are worth; elsewhere a bootstrap over episodes within tasks ({protocol.samples:,} samples, seed "
-        f"{protocol.seed}). They speak of other episodes of the same tasks, the deviation of other seeds.</p>"
-        "<p>Comparisons pair the episodes: an exact sign test on the episodes that one method solves in more of its "
-        "runs than the other (McNemar's test where each has one run), corrected by Holm for the number of pairs.</p>"
-    )
+        f"{protocol.seed}). They describe other episodes of the same tasks, the deviation other seeds.",
+        "Comparisons pair the episodes: an exact sign test on the episodes that one method solves in more of its runs "
+        "than the other (McNemar's test where each has one run), corrected by Holm for the number of pairs.",
+    ]
 
 
-def pair(left: tuple[str, str, str], right: tuple[str, str, str]) -> str:
-    """Two boxes beside each other, each title, body and caption."""
-    return f"<div class=two>{section(*left)}{section(*right)}</div>"
+UNKNOWN = "not recorded with these results: state it manually"
+RECIPE = {
+    "steps": "updates", "batch_size": "samples an update", "lr": "peak learning rate", "warmup": "warm-up updates",
+    "ema": "decay of the averaged weights", "weight_decay": "weight decay",
+}  # fmt: skip
+"""Settings of a training worth stating, and what they are called."""
 
 
-def section(title: str, body: str, caption: str = "") -> str:
-    """A box of a page."""
-    below = f"<p class=caption>{escape(caption)}</p>" if caption else ""
-    return f"<section><h2>{escape(title)}</h2><div class=scroll>{body}</div>{below}</section>"
+def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What a policy's configuration states of it and of its training, for the notes of a run."""
+    card = config.get("card")
+    card = card if isinstance(card, Mapping) else {}
+    parts = {part: _section(config.get(part)) for part in ("memory", "integration")}
+    return {**parts, "data": card.get("data"), "recipe": card.get("recipe")}
 
 
-def html_table(table: Table) -> str:
-    """A table of a page."""
-    head = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
-    rows = []
-    for i, row in enumerate(table.rows):
-        kind = " ".join(name for name, where in (("rule", table.rules), ("strong", table.strong)) if i in where)
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in row)
-        rows.append(f'<tr class="{kind}">{cells}</tr>' if kind else f"<tr>{cells}</tr>")
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
+    """The `run.json` beside files of records, each once; records without one are passed over."""
+    folders = dict.fromkeys(path.parent for path in records)
+    return [read_run(folder) for folder in folders if (folder / RUN_FILE).is_file()]
+
+
+def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]]) -> str:
+    """The section `Training details` of a submission, in Markdown."""
+    policies = []
+    for method in methods:
+        for checkpoint in dict.fromkeys(run.key.checkpoint for run in method.runs):
+            about = [
+                run for run in runs
+                if (run["settings"].get("model"), run["settings"].get("checkpoint")) == (method.model, checkpoint)
+                and method.composition in ((run.get("notes") or {}).get("composition"), None)
+            ]  # fmt: skip
+            facts = next((run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")), None)
+            seeds = sorted({run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint})
+            record = next(r for run in method.runs if run.key.checkpoint == checkpoint for r in run.records.values())
+            evaluation = (
+                f"split {record.split}, {record.action_space} actions, at most {record.max_steps} steps, "
+                f"model seeds {', '.join(map(str, seeds))}"
+            )
+            title = f"{method.label}, checkpoint {checkpoint}"
+            policies.append({"title": title, "facts": [*_lines(facts), ("evaluation", evaluation)]})
+    return render("training.md", policies=policies)
+
+
+def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    if facts is None:
+        return [("policy", UNKNOWN), ("training", UNKNOWN)]
+    memory, integration, recipe = facts.get("memory"), facts.get("integration"), facts.get("recipe")
+    memory, integration = _section(memory), _section(integration)
+    policy = f"memory {memory.get('name', 'without a name')}" if memory else "no memory"
+    if memory and memory.get("budget") is not None:
+        policy += f", {_text(memory['budget'])} tokens"
+    if integration:
+        policy += f", integration {integration.get('name', 'without a name')}"
+    if not recipe:
+        return [("policy", policy), ("training", UNKNOWN)]
+    settings = _settings(recipe) if isinstance(recipe, Mapping) else str(recipe)
+    return [("policy", policy), ("data", str(facts.get("data") or UNKNOWN)), ("training", settings)]
+
+
+def _settings(recipe: Mapping[str, Any]) -> str:
+    stated = (f"{words} {_text(recipe[name])}" for name, words in RECIPE.items() if recipe.get(name) is not None)
+    return ", ".join(stated) or UNKNOWN
+
+
+def _section(value: Any) -> dict[str, Any] | None:
+    """A part of the configuration; one that is a word alone is its name."""
+    if not value:
+        return None
+    return dict(value) if isinstance(value, Mapping) else {"name": str(value)}
+
+
+def _text(value: Any) -> str:
+    """A number in its shortest form; anything else (YAML reads `1e-4` as text) as it is."""
+    return f"{value:g}" if isinstance(value, int | float) else str(value)

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -10,7 +9,8 @@ from typing import TYPE_CHECKING
 from mme_vla.errors import printable
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.suites import PAPER_SEEDS
+from mme_vla.evaluation.results.scopes import PAPER_SEEDS
+from mme_vla.utils.pages import escape_markdown
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -30,7 +30,7 @@ class Table:
 def show(figure: Figure, short: bool = False) -> str:
     """A figure as text: mean ± deviation, or how far it is.
 
-    A mean that leaves incomplete runs out says of how many it is.
+    A mean without the incomplete runs states its number of runs.
     """
     if figure.mean is None:
         if short:
@@ -163,8 +163,8 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
                     else 100 * sum(outcomes) / len(outcomes)
                 )
             values.append(row)
-        whole = [[row[i] for row in values] for i in range(len(runs))]
-        values.append([_mean(column) for column in whole])
+        run_columns = [[row[i] for row in values] for i in range(len(runs))]
+        values.append([_mean(column) for column in run_columns])
         names = [*results.protocol.averaged, "**Average**"]
         rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(names, values, strict=True)]
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
@@ -209,11 +209,6 @@ def to_markdown(table: Table) -> str:
     lines = [table.columns, [":---", *["---:"] * (len(table.columns) - 1)], *table.rows]
     body = "\n".join("| " + " | ".join(map(escape_markdown, line)) + " |" for line in lines)
     return f"### {escape_markdown(table.title)}\n\n{body}\n"
-
-
-def escape_markdown(text: str) -> str:
-    """Text in one line of Markdown: no name in it becomes a link, a picture, HTML, or a cell of its own."""
-    return re.sub(r"[\\|<`]|(?<=\])[(:\[]", r"\\\g<0>", " ".join(text.splitlines()))
 
 
 _LATEX = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "±": r"$\pm$", "−": "$-$",

@@ -15,13 +15,12 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.make import make_env
-from mme_vla.envs.process import process_score
-from mme_vla.envs.subtasks import Progress
-from mme_vla.envs.task_names import STICK_TASKS
+from mme_vla.envs.metadata import STICK_TASKS
+from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout.film import EpisodeVideo, video_name
+from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
 OPTIONS = "available_multi_choices"
@@ -33,20 +32,20 @@ REPORTED = (
 _BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
-"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not asked for; `state`: float32 [t, s].
+"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not requested; `state`: float32 [t, s].
 
 The robot's `readings`, if it has any, are lists of all frames.
 """
 
 
 class RenderClock:
-    """Adds up what the simulator spends on taking pictures, where its scene is within reach."""
+    """Adds up what the simulator spends on taking images, where its scene is within reach."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def watch(self, env: Any) -> None:
-        """Time the pictures of this environment; those of the official package cannot be told from its simulation."""
+        """Time the images of this environment; those of the official package are part of its simulation."""
         scene = getattr(getattr(env, "task", None), "scene", None)
         if scene is None:
             return
@@ -73,8 +72,8 @@ class ChunkEnv:
         stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
         max_steps: actions after which the outcome is `timeout`, should the environment itself not say so: one more
             than this is executed, as in the benchmark.
-        video: draws the episode as it goes.
-        robot: says which cameras are read and how wide an action is.
+        video: records the episode.
+        robot: the cameras that are read and the width of an action.
         most_actions: actions that are executed at most, whatever frames they took; then the outcome is `timeout`.
     """
 
@@ -85,10 +84,10 @@ class ChunkEnv:
         max_steps: int = 1300,
         video: EpisodeVideo | None = None,
         robot: Embodiment = ROBOMME_JOINT,
-        most_actions: int | None = None,
+        max_actions: int | None = None,
     ) -> None:
         self._robot, self._stick = robot, stick
-        self._most_actions, self._executed = most_actions, 0
+        self._max_actions, self._executed = max_actions, 0
         self._max_steps, self._video = max_steps, video
         self._clock = RenderClock()
         self._simulating = self._rendered = 0.0
@@ -98,11 +97,11 @@ class ChunkEnv:
             self._env = make()
         self._clock.watch(self._env)
 
-    def reset(self, draw: Drawing | None = None) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, dict[str, Any]]:
         """All frames of the conditioning video, the current one last, and the report.
 
         Args:
-            draw: the pictures that are asked for; by default all.
+            draw: the requested images; by default all.
         """
         self._ask(draw)
         with self._simulation():
@@ -118,17 +117,17 @@ class ChunkEnv:
         """Execute actions one after the other until they, or the episode, are over.
 
         Args:
-            command: `actions` [n, w]; `subgoal`, the text that stands in the video meanwhile; `draw`, the pictures that
-                are asked for, where it is not all: frames are counted from the reset on, and the newest is the last.
+            command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that
+                are requested, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
             The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
             actions, and `steps`, that of frames.
         """
-        frames, executed, seen = _Frames(self._robot), 0, 0
+        frames, executed, n_frames = _Frames(self._robot), 0, 0
         terminated = truncated = False
         info: dict[str, Any] = {}
-        draw: Drawing | None = command.get("draw")
+        draw: RenderRequest | None = command.get("draw")
         actions = np.asarray(command["actions"])
         for number, action in enumerate(actions, 1):
             self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
@@ -146,16 +145,16 @@ class ChunkEnv:
             self._executed += 1
             count = frames.add(observation)
             self._note_pose(observation)
-            seen += count
-            self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could go on for ever
+            n_frames += count
+            self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could continue for ever
             self._draw(frames, count, caption=command.get("subgoal"))
-            spent = self._executed == self._most_actions
+            spent = self._executed == self._max_actions
             if not (terminated or truncated) and (spent or self._steps > self._max_steps):
                 truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
                 break
         self._returned = frames.leave(draw, self._returned)
-        report = self._report(info) | {"executed": executed, "steps": seen}
+        report = self._report(info) | {"executed": executed, "steps": n_frames}
         if terminated or truncated:
             report |= self._finish_video(report)
         return frames.observation(), 0.0, terminated, truncated, report
@@ -170,16 +169,16 @@ class ChunkEnv:
         if not self._robot.action.of_pose:
             return
         if "eef_state_list" not in observation:
-            given = ", ".join(sorted(observation))
+            available = ", ".join(sorted(observation))
             raise UserError(f"The policy's actions are differences to 'eef_state', which this environment does not "
-                            f"deliver: only {given}.")  # fmt: skip
+                            f"deliver: only {available}.")  # fmt: skip
         if poses := observation["eef_state_list"]:
             self._pose = np.asarray(poses[-1], np.float64)
 
-    def _ask(self, drawing: Drawing | None) -> None:
-        # A film shows everything; and not every environment can leave pictures out.
-        if self._video is None and hasattr(self._env, "drawing"):
-            self._env.drawing = drawing
+    def _ask(self, request: RenderRequest | None) -> None:
+        # A video shows everything; and not every environment can leave images out.
+        if self._video is None and hasattr(self._env, "render_request"):
+            self._env.render_request = request
 
     @contextmanager
     def _simulation(self) -> Iterator[None]:
@@ -187,9 +186,9 @@ class ChunkEnv:
         try:
             yield
         finally:
-            pictures = self._clock.seconds - rendered
-            self._rendered += pictures
-            self._simulating += time.perf_counter() - begun - pictures
+            render_seconds = self._clock.seconds - rendered
+            self._rendered += render_seconds
+            self._simulating += time.perf_counter() - begun - render_seconds
 
     def _report(self, info: dict[str, Any]) -> dict[str, Any]:
         report = {key: info[key] for key in REPORTED if key in info}
@@ -216,7 +215,7 @@ class ChunkEnv:
 
 
 def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
-    """Whether an action asked for a pose that no joints or no motion reach: the policy's failure, not the machine's."""
+    """Whether no joints or no motion reach an action's pose: the policy's failure, not the machine's."""
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
@@ -225,7 +224,7 @@ class _Frames:
 
     def __init__(self, robot: Embodiment) -> None:
         self._cameras = robot.camera_names
-        self._pictures: dict[str, list[np.ndarray | None]] = {name: [] for name in (*self._cameras, *CAMERAS)}
+        self._images: dict[str, list[np.ndarray | None]] = {name: [] for name in (*self._cameras, *CAMERAS)}
         self._readings: dict[str, list[np.ndarray]] = {name: [] for name in robot.readings}
         self._states: list[np.ndarray] = []
 
@@ -233,36 +232,38 @@ class _Frames:
         """Take the benchmark's lists; how many frames they hold."""
         joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
         self._states += [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
-        blind = not any(key.endswith("_rgb_list") for key in observation)  # it was asked not to render
-        for name, pictures in self._pictures.items():
+        blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
+        for name, images in self._images.items():
             if not blind and name in self._cameras and f"{name}_rgb_list" not in observation:
                 raise UserError(f"The environment has no camera {name!r}; it shows {', '.join(sorted(observation))}.")
-            pictures += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
+            images += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         for name, readings in self._readings.items():
             if f"{name}_list" not in observation:
-                given = ", ".join(sorted(observation))
-                raise UserError(f"The policy reads {name!r}, which this environment does not deliver: only {given}.")
+                available = ", ".join(sorted(observation))
+                raise UserError(
+                    f"The policy reads {name!r}, which this environment does not deliver: only {available}."
+                )
             readings += observation[f"{name}_list"]
         return len(joints)
 
-    def leave(self, draw: Drawing | None, first: int) -> int:
-        """Leave out the pictures that were not asked for; from the first frame's number to the one that follows."""
+    def leave(self, draw: RenderRequest | None, first: int) -> int:
+        """Leave out the images that were not requested; from the first frame's number to the one that follows."""
         stop = first + len(self._states)
         if draw is not None:
             for frame in range(first, stop):
-                shown = draw.cameras(frame, newest=frame == stop - 1)
+                cameras = draw.cameras(frame, newest=frame == stop - 1)
                 for name in self._cameras:
-                    if name not in shown:
-                        self._pictures[name][frame - first] = None
+                    if name not in cameras:
+                        self._images[name][frame - first] = None
         return stop
 
     def newest(self, count: int) -> Iterator[tuple[Any, ...]]:
-        """The last frames before any was left out, each as its pictures: the robot's cameras, then the benchmark's."""
-        return zip(*(pictures[len(self._states) - count :] for pictures in self._pictures.values()), strict=True)
+        """The last frames before any was left out, each as its images: the robot's cameras, then the benchmark's."""
+        return zip(*(images[len(self._states) - count :] for images in self._images.values()), strict=True)
 
     def observation(self) -> Observation:
         state = np.stack(self._states) if self._states else np.zeros((0, ROBOMME_JOINT.state.width), np.float32)
-        return {**{name: self._pictures[name] for name in self._cameras}, **self._readings, "state": state}
+        return {**{name: self._images[name] for name in self._cameras}, **self._readings, "state": state}
 
 
 def make_rollout_env(
@@ -274,7 +275,7 @@ def make_rollout_env(
     max_steps: int = 1300,
     videos: tuple[str, str] | None = None,
     robot: Embodiment = ROBOMME_JOINT,
-    most_actions: int | None = None,
+    max_actions: int | None = None,
     **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
@@ -286,13 +287,13 @@ def make_rollout_env(
     """
     video = None
     if videos is not None:
-        folder, kept = videos
-        video = EpisodeVideo(lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), kept)
+        folder, save_on = videos
+        video = EpisodeVideo(lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), save_on)
     return ChunkEnv(
         lambda: base(task=task, split=split, episode=episode, max_steps=max_steps, **options),
         stick=task in STICK_TASKS or (task in TASKS and bool(getattr(TASKS[task], "stick", False))),
         max_steps=max_steps,
         video=video,
         robot=robot,
-        most_actions=most_actions,
+        max_actions=max_actions,
     )

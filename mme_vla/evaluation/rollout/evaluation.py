@@ -1,35 +1,69 @@
 """A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode at once."""
 
+import os
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mme_vla.embodiment.robomme import check_benchmark
+from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.envs.vector.pool import VecEnv
+from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError
-from mme_vla.evaluation.claims import Claims
-from mme_vla.evaluation.forecast import Durations, earlier_records
-from mme_vla.evaluation.record_log import RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.plan import Shard
-from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
+from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
-from mme_vla.evaluation.rollout.waiting import Waiting
-from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
-from mme_vla.files import remove_drafts, safe_name
+from mme_vla.evaluation.rollout.subgoals import SUBGOALS
+from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
-from mme_vla.processing.subgoal_text import subgoal_kind
+from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
+from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
+from mme_vla.utils import remove_drafts, safe_name
 
-USUAL_BUDGET = 512
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several processes that share a run."""
+
+    index: int = 0
+    count: int = 1
+
+    @property
+    def file(self) -> str:
+        """Name of the file its records go to."""
+        return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
+
+
+def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test") -> list[Job]:
+    """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`)."""
+    return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split)]
+
+
+def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
+    """Read `0/4` (the first of four), or the rank of this process under torchrun.
+
+    Args:
+        text: wins over the environment. environment: by default the process's own.
+    """
+    environment = os.environ if environment is None else environment
+    if text is None:
+        if "RANK" not in environment or "WORLD_SIZE" not in environment:
+            return Shard()
+        text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
+    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
+    shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
+    if shard.index >= shard.count:
+        raise UserError(f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
+    return shard
+
+
+DEFAULT_BUDGET = 512
 VIDEOS = "videos"
 
 
@@ -62,17 +96,17 @@ def evaluate(
     base: Callable[..., Any] = make_env,
     notes: dict[str, Any] | None = None,
     times_from: Path | None = None,
-    shown: bool = True,
+    show_progress: bool = True,
 ) -> Evaluation:
     """Run every episode that `output` has no result of yet.
 
     Args:
         policy: in eval mode, on its device, with statistics.
         jobs: the episodes of the run. shard: which of how many processes this is; each takes the next episode that is
-            free when it has room (`claims.py`).
+            free when it has room (`store.Claims`).
         output: the run's folder; one that holds a part of the same run is gone on with.
         facts: what the records say of the policy.
-        subgoals: who says the subgoal, where the policy reads one.
+        subgoals: predicts the subgoal, where the policy reads one.
         source: where the weights are from; part of what makes a run the same.
         base: makes an environment with the benchmark's interface; importable by name.
         notes: kept in `run.json` and never compared.
@@ -84,21 +118,21 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
-    check_sessions(settings.split, policy.sessions_before)
+    check_sessions(settings.split, _n_distractors(policy))
     if base is make_env:
         check_benchmark(policy.embodiment, ACTION_SPACES)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
     shard = shard or Shard()
     with RecordLog(output / shard.file) as log:
-        remove_drafts(output / VIDEOS)  # films of workers that were killed
+        remove_drafts(output / VIDEOS)  # videos of workers that were killed
         done = _done(output, jobs, facts)
         missing = [job for job in jobs if (job.task, job.episode) not in finished(done)]
         durations = Durations(earlier_records(output, times_from))
         missing = durations.longest_first(missing)
-        kept = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(len(jobs), kept, shown) as progress:
-            if kept:
-                progress.say(f"{output} holds {len(kept)} of {len(jobs)} episodes: going on with the others")
+        completed = [record for record in done if record.outcome != "error"]
+        with RolloutProgress(len(jobs), completed, show_progress) as progress:
+            if completed:
+                progress.say(f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the others")
             workers = settings.worker_count(-(-len(missing) // shard.count))
             if forecast := durations.forecast(missing, workers, shard.count):
                 progress.say(str(forecast))
@@ -108,14 +142,18 @@ def evaluate(
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
+def _n_distractors(policy: Policy) -> int:
+    return policy.n_distractor_episodes if isinstance(policy, ShowsDistractors) else 0
+
+
 def _environments(
     policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
 ) -> VecEnv:
     robot = policy.embodiment
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
-    options["most_actions"] = policy.most_actions
+    options["max_actions"] = policy.max_actions if isinstance(policy, LimitsActions) else None
     if base is make_env:
-        options |= {"sessions": policy.sessions_before}
+        options |= {"sessions": _n_distractors(policy)}
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
         options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":
@@ -155,7 +193,7 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
     batches may change the last bits of an action.
     """
-    kept = ("seed", "split", "env", "max_steps", "render")
+    names = ("seed", "split", "env", "max_steps", "render")
     dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
     return {
         "model": facts.model,
@@ -165,8 +203,8 @@ def run_settings(
         "dtype": dtype,
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
-        "flow_steps": settings.flow_steps or policy.sample_steps,
-        **{name: getattr(settings, name) for name in kept},
+        "flow_steps": settings.flow_steps or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
+        **{name: getattr(settings, name) for name in names},
     }
 
 
@@ -183,19 +221,15 @@ def _end_of(place: str | None) -> str | None:
 
 
 def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
-    """Refuse a predictor that says what this policy was not trained to read.
-
-    Raises:
-        UserError: the policy reads no subgoal, or another kind.
-    """
+    """Refuse a predictor whose subgoals this policy was not trained to read."""
     if subgoals is None:
         return
-    if not policy.require_processor().reads_subgoal:
+    if not policy.require_processor().prompt_spec.reads_subgoal:
         raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
     kind = subgoal_kind(policy)
     if kind is not None and kind != f"{subgoals.kind}_subgoal":
-        wanted = kind.removesuffix("_subgoal")
-        raise UserError(f"The policy was trained with {wanted} subgoals: set subgoal.kind={wanted}.")
+        expected = kind.removesuffix("_subgoal")
+        raise UserError(f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}.")
 
 
 def checkpoint_label(source: str | None) -> int | str:
@@ -210,7 +244,7 @@ def checkpoint_label(source: str | None) -> int | str:
 def memory_budget(policy: Policy) -> int | None:
     """Memory tokens, where they are not the usual 512."""
     budget = None if policy.memory is None else policy.memory.budget
-    return None if budget == USUAL_BUDGET else budget
+    return None if budget == DEFAULT_BUDGET else budget
 
 
 def default_output(facts: RunFacts) -> Path:
@@ -227,9 +261,9 @@ def _done(output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | Non
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
     run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
                  facts.composition)  # fmt: skip
-    wanted = {(job.task, job.episode) for job in jobs}
+    keys = {(job.task, job.episode) for job in jobs}
     files = sorted(output.glob("episodes*.jsonl")) if shard is None or shard.count == 1 else [output / shard.file]
-    found = [record for path in files for record in read_records(path)]
+    records = [record for path in files for record in read_records(path)]
     # run.json has seen to it that this is the same policy: records from before there were digests are of it too.
-    found = [replace(r, composition=facts.composition) if r.composition is None else r for r in found]
-    return [record for record in merge(found, "first") if record.run == run and record.key in wanted]
+    records = [replace(r, composition=facts.composition) if r.composition is None else r for r in records]
+    return [record for record in merge(records, "first") if record.run == run and record.key in keys]

@@ -1,13 +1,20 @@
-"""What a person sees of a running evaluation: a bar with the success so far, and a line for every episode."""
+"""How long a run takes: a forecast from earlier records, and what a person sees of it as it goes."""
 
+import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.store import find_records, read_records
 
 
 class RolloutProgress:
@@ -17,11 +24,11 @@ class RolloutProgress:
         total: episodes of this process. before: records of those that an earlier run has finished.
     """
 
-    def __init__(self, total: int, before: Sequence[EpisodeRecord] = (), shown: bool = True) -> None:
-        self.console = Console(quiet=not shown, highlight=False, soft_wrap=True, stderr=True)
+    def __init__(self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True) -> None:
+        self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
         self.total, self._outcomes = total, Counter(record.outcome for record in before)
         self._bar: Progress | None = None
-        if self.console.is_terminal and shown:
+        if self.console.is_terminal and visible:
             clock = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
             columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), *clock)
             self._bar = Progress(*columns, console=self.console)
@@ -69,3 +76,84 @@ class RolloutProgress:
     def say(self, text: str) -> None:
         """Print a line that stays."""
         self.console.print(text, markup=False)
+
+
+def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
+    """Records without errors of a file or folder, by default of `output` and the folders beside it."""
+    if named is not None:
+        records = [record for path in find_records([named]) for record in read_records(path)]
+    else:
+        records = []
+        for path in sorted(output.parent.glob("*/episodes*.jsonl")):
+            # What is damaged, or being written, is another run's: its own command will say so.
+            with suppress(UserError), warnings.catch_warnings(action="ignore"):
+                records += read_records(path)
+    return [record for record in records if record.outcome != "error"]
+
+
+_Place = tuple[str | None, int | None]
+
+
+def _places(episode: Job | EpisodeRecord) -> tuple[_Place, ...]:
+    """What an episode's time is looked up under, the nearest first: itself, its task, anything."""
+    return (episode.task, episode.episode), (episode.task, None), (None, None)
+
+
+class Durations:
+    """Seconds of an episode: in its environment, and the policy's for it."""
+
+    def __init__(self, records: Iterable[EpisodeRecord]) -> None:
+        self.records = list(records)
+        self._means: dict[_Place, tuple[float, float]] = {}
+        groups: dict[_Place, list[EpisodeRecord]] = {}
+        for record in self.records:
+            for place in _places(record):
+                groups.setdefault(place, []).append(record)
+        for place, members in groups.items():
+            environment = sum(r.seconds.sim + r.seconds.render for r in members) / len(members)
+            self._means[place] = environment, sum(r.seconds.policy for r in members) / len(members)
+
+    def of(self, job: Job) -> tuple[float, float]:
+        """(environment, policy): of the episode itself, else the mean of its task, else of all; 0 without records."""
+        for place in _places(job):
+            if place in self._means:
+                return self._means[place]
+        return 0.0, 0.0
+
+    def longest_first(self, jobs: Sequence[Job]) -> list[Job]:
+        """The jobs, those that took longest first; in their own order without records."""
+        return sorted(jobs, key=lambda job: -sum(self.of(job)))
+
+    def forecast(self, jobs: Sequence[Job], workers: int, processes: int = 1) -> "Forecast | None":
+        """What running the jobs will take; None without records.
+
+        Environments run side by side while the policy acts: the slower of the two decides, and the
+        longest episode is waited for in any case.
+
+        Args:
+            workers: environments at a time in a process. processes: that share the run.
+        """
+        if not self.records or not jobs:
+            return None
+        each = [self.of(job) for job in jobs]
+        environment, policy = (sum(column) for column in zip(*each, strict=True))
+        seconds = max(environment / workers, policy, max(map(sum, each)) * processes) / processes
+        return Forecast(seconds, len(jobs), len(self.records), workers * processes)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """seconds: from now to the end. episodes: that are left. records: it is made from. at_once: environments."""
+
+    seconds: float
+    episodes: int
+    records: int
+    at_once: int
+
+    def __str__(self) -> str:
+        hours = self.seconds / 3600
+        time = f"{hours:.1f} h" if hours >= 1 else f"{self.seconds / 60:.0f} min"
+        return (
+            f"forecast: about {time} for {self.episodes:,} episodes, {self.at_once} at a time, if they take as long as "
+            f"the {self.records:,} before them did"
+        )

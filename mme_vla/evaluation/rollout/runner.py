@@ -1,12 +1,12 @@
-"""Many episodes at once: environments in worker processes, one policy that answers whoever waits in one batch.
+"""Many episodes at once: environments in worker processes, one policy that acts for the waiting ones in one batch.
 
-Each worker executes its chunk at its own pace. Whoever has finished one is in the policy's next batch; nobody waits
-for a slow episode, and a long conditioning video is read in pieces between batches.
+Each worker executes its chunk at its own pace. One that has finished is in the policy's next batch. No episode waits
+for a slow one, and a long conditioning video is read in pieces between batches.
 """
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -14,20 +14,47 @@ from typing import Protocol
 import numpy as np
 
 from mme_vla.envs import metadata
-from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.process_scores import EXTRA as PROCESS
-from mme_vla.evaluation.rollout.pictures import Pictures
+from mme_vla.evaluation.results.curves import EXTRA as PROCESS
+from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.running_episode import RunningEpisode
+from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.rollout.subgoal_score import EXTRA
-from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
-from mme_vla.evaluation.rollout.waiting import Waiting
+from mme_vla.evaluation.rollout.subgoals import EXTRA, SubgoalTrace
+from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
-from mme_vla.policy.batching import Act, Prepare, Turns
+from mme_vla.policy.capabilities import PreparesChunks
+from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.subgoal import SubgoalPredictor
+
+
+class Waiting:
+    """Episodes in the order they begin.
+
+    Args:
+        jobs: all that are left. claims: where other processes run the same ones; each then begins what it could claim.
+    """
+
+    def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
+        self._jobs, self._claims = list(jobs), claims
+        self._again: list[Job] = []
+
+    def take(self) -> Job | None:
+        """The next episode to begin, if there is one; those tried again come last."""
+        if self._claims is None:
+            job = self._jobs.pop(0) if self._jobs else None
+        else:
+            job = self._claims.take(self._jobs)
+            if job is not None:
+                self._jobs.remove(job)
+        return self._again.pop(0) if job is None and self._again else job
+
+    def put_back(self, job: Job) -> None:
+        """Have an episode run once more, by this process."""
+        self._again.append(job)
+
 
 GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
 
@@ -75,15 +102,15 @@ class Workload:
 
 @dataclass
 class Rollout:
-    """Runs episodes and records each the moment it ends.
+    """Runs episodes and records each when it ends.
 
     Args:
         policy: in eval mode, on its device.
         envs: environments that take chunks (`make_rollout_env`).
         facts: what the records say of the policy.
         record: called with every record, as soon as there is one.
-        subgoals: who says the subgoal; None leaves it out of the prompt.
-        subgoal_folder: where every subgoal is written down with its picture; None keeps the scores alone.
+        subgoals: predicts the subgoal; None leaves it out of the prompt.
+        subgoal_folder: where every subgoal is written down with its image; None keeps the scores alone.
     """
 
     policy: Policy
@@ -93,7 +120,7 @@ class Rollout:
     record: Callable[[EpisodeRecord], None]
     subgoals: SubgoalPredictor | None = None
     subgoal_folder: Path | None = None
-    progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, shown=False))
+    progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, visible=False))
     workload: Workload = field(default_factory=Workload)
     _waiting: Waiting = field(default_factory=Waiting)
     _running: dict[int, RunningEpisode] = field(default_factory=dict)
@@ -101,23 +128,19 @@ class Rollout:
     _stillborn: int = 0
 
     def __post_init__(self) -> None:
-        self._turns: Turns[RunningEpisode, RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
-        self._pictures = Pictures(self.policy, self.subgoals, self.settings)
+        self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(self.settings.max_batch)
+        self._render_plan = RenderPlan(self.policy, self.subgoals, self.settings)
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
-        """Run these episodes.
-
-        Raises:
-            UserError: the environments cannot be built, or a policy and its subgoals do not go together.
-        """
+        """Run these episodes."""
         begun = time.perf_counter()
         self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
         for worker in range(self.envs.workers):
             self._start(worker)
-        while self.envs.busy or self._turns:
-            for reply in self.envs.recv(0 if self._turns else None):
+        while self.envs.busy or self._scheduler:
+            for reply in self.envs.recv(0 if self._scheduler else None):
                 self._take(reply)
-            self._turn()
+            self._run_scheduler()
         self.workload.wall_s += time.perf_counter() - begun
 
     def _start(self, worker: int) -> None:
@@ -134,13 +157,13 @@ class Rollout:
         running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace)
         running.worker = worker
         self._running[worker] = running
-        self.envs.start(worker, job, draw=self._pictures.before_video())
+        self.envs.start(worker, job, draw=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
         """Deal with what came back from a worker."""
         running = self._running[reply.worker]
-        self._turns.later.pop(running, None)
-        running.tick(reply.info)
+        self._scheduler.later.pop(running, None)
+        running.add_env_seconds(reply.info)
         if reply.info.get("exception_type") == "UserError" and reply.crashed:
             raise UserError(str(reply.info.get("error_message")))
         if reply.done:
@@ -160,12 +183,12 @@ class Rollout:
                 return
             running.begin(reply.observation, reply.info)
         else:
-            running.go_on(reply.observation, reply.info)
-        self._turns.reading.append(running)
+            running.resume(reply.observation, reply.info)
+        self._scheduler.reading.append(running)
 
     def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
-        """Let the episode begin once more if pictures of its video are needed that it did not draw."""
-        missing, length = self._pictures.missing(reply.observation), len(reply.observation["state"]) - 1
+        """Let the episode begin once more if images of its video are needed that it did not draw."""
+        missing, length = self._render_plan.missing(reply.observation), len(reply.observation["state"]) - 1
         if running.redrawn not in (None, length):
             raise UserError(
                 f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
@@ -177,18 +200,18 @@ class Rollout:
         self.envs.start(running.worker, running.job, draw=missing)
         return True
 
-    def _turn(self) -> None:
+    def _run_scheduler(self) -> None:
         begun = time.perf_counter()
-        for step in self._turns.turn():
+        for step in self._scheduler.next_steps():
             if isinstance(step, Act):
                 self._act(step.batch)
             elif isinstance(step, Prepare):
-                if self.policy.prepare(step.work.episode):
-                    self._turns.later[step.work] = None
+                if isinstance(self.policy, PreparesChunks) and self.policy.prepare(step.work.episode):
+                    self._scheduler.later[step.work] = None
             else:
                 step.work.read()
                 if not step.work.pieces:
-                    self._turns.acting.append(step.work)
+                    self._scheduler.acting.append(step.work)
         self.workload.policy_s += time.perf_counter() - begun
 
     def _act(self, batch: list[RunningEpisode]) -> None:
@@ -197,21 +220,21 @@ class Rollout:
             subgoals = self.subgoals.predict([running.watched for running in batch])
             latency = time.perf_counter() - begun
             for running, subgoal in zip(batch, subgoals, strict=True):
-                running.told(subgoal, latency)
+                running.set_subgoal(subgoal, latency)
         chunks = self.policy.act([running.episode for running in batch], self.settings.flow_steps)
         self.workload.batches += 1
         self.workload.chunks += len(batch)
         share = (time.perf_counter() - begun) / len(batch)
         for running, chunk in zip(batch, chunks, strict=True):
-            running.thought(share)
+            running.add_policy_seconds(share)
             actions = chunk[: self.settings.execute or self.policy.embodiment.action.execute]
             if not np.isfinite(actions).all():
                 self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
                 continue
-            running.chosen(actions)
-            draw = self._pictures.of_chunk(running.episode.frames_seen, len(actions), running.video_frames)
+            running.set_actions(actions)
+            draw = self._render_plan.of_chunk(running.episode.n_observed_frames, len(actions), running.video_frames)
             self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
-            self._turns.later[running] = None
+            self._scheduler.later[running] = None
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         """Record an episode and let its worker begin another."""

@@ -1,4 +1,4 @@
-"""What a rollout can be told, checked before anything is loaded."""
+"""The settings of a rollout, checked before anything is loaded."""
 
 import os
 from collections.abc import Mapping
@@ -9,10 +9,10 @@ from mme_vla.config.sections import read_section
 from mme_vla.envs.make import ENVS
 from mme_vla.envs.metadata import check_split
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.evaluation.rollout.film import KEPT
-from mme_vla.evaluation.suites import MAX_STEPS
+from mme_vla.evaluation.results.scopes import MAX_STEPS
+from mme_vla.evaluation.rollout.video import SAVE_ON
 
-DRAWN = ("needed", "all")
+RENDER_MODES = ("needed", "all")
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,14 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
-    execute: actions of a chunk that are executed before the policy is asked again; None: as the robot says.
+    execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
     encode_chunk: frames encoded before other episodes may act.
-    retries: how often an episode whose environment failed is tried again before the run goes on without it.
-    timeout_s: seconds after which an environment that does not answer is replaced.
-    draw: `needed`: pictures of what the policy and its subgoals look at; `all`: of every frame. Outcomes are the same.
-    subgoal_log: whether every subgoal is written down with its picture, where a predictor says them.
+    retries: how often an episode whose environment failed is tried again before the run continues without it.
+    timeout_s: seconds after which an environment that does not respond is replaced.
+    draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes are the same.
+    subgoal_log: whether every predicted subgoal is logged with its image.
     """
 
     seed: int = 42
@@ -48,8 +48,8 @@ class RolloutSettings:
 
     def __post_init__(self) -> None:
         for name, value, known in (
-            ("env", self.env, ENVS), ("video", self.video, KEPT),
-            ("draw", self.draw, DRAWN),
+            ("env", self.env, ENVS), ("video", self.video, SAVE_ON),
+            ("draw", self.draw, RENDER_MODES),
         ):  # fmt: skip
             if value not in known:
                 raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")
@@ -57,11 +57,11 @@ class RolloutSettings:
             raise UserError(f"split={self.split} varies this library's scenes: leave out env=official.")
         least = {"max_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
         for name, smallest in least.items():
-            self._whole(name, getattr(self, name), smallest)
-        self._whole("seed", self.seed, 0)
+            self._check_integer(name, getattr(self, name), smallest)
+        self._check_integer("seed", self.seed, 0)
         for name in ("workers", "execute", "flow_steps"):
             if getattr(self, name) is not None:
-                self._whole(name, getattr(self, name), 1)
+                self._check_integer(name, getattr(self, name), 1)
         if not self.timeout_s > 0:
             raise UserError(f"timeout_s={self.timeout_s!r} must be a positive number of seconds.")
         if self.env == "official" and not self.render:
@@ -69,19 +69,15 @@ class RolloutSettings:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Read the keys of a configuration that are settings; others are ignored.
-
-        Raises:
-            UserError: a value that cannot be.
-        """
+        """Read the keys of a configuration that are settings; others are ignored."""
         return read_section(cls, config, others=True)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""
-        wanted = min(len(os.sched_getaffinity(0)), 16) if self.workers is None else self.workers
-        return max(1, min(wanted, episodes))
+        requested = min(len(os.sched_getaffinity(0)), 16) if self.workers is None else self.workers
+        return max(1, min(requested, episodes))
 
     @staticmethod
-    def _whole(name: str, value: Any, least: int) -> None:
+    def _check_integer(name: str, value: Any, least: int) -> None:
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise UserError(f"{name}={value!r} must be a whole number, at least {least}.")

@@ -1,10 +1,10 @@
 // The page: shows what the server says, lets a person watch, point and choose.
 
-import { Film } from "./film.js";
+import { Player } from "./player.js";
 
 const SIDE = 256;
 const $ = (id) => document.getElementById(id);
-const film = new Film($("picture"), showFrame);
+const player = new Player($("image"), showFrame);
 let state = { phase: "loading", options: [], reveals: [], decisions: [] };
 let fetched = 0; // clips whose frames are here
 let chosen = null; // the option selected
@@ -19,10 +19,10 @@ async function ask(path, message) {
   const options = message === undefined ? {} : {
     method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message),
   };
-  const answer = await fetch(path, options);
-  const content = await answer.json();
-  if (!answer.ok && answer.status !== 409) throw new Error(content.error);
-  return answer.ok ? content : (complain(content.error), ask("state"));
+  const response = await fetch(path, options);
+  const content = await response.json();
+  if (!response.ok && response.status !== 409) throw new Error(content.error);
+  return response.ok ? content : (complain(content.error), ask("state"));
 }
 
 async function poll() {
@@ -30,17 +30,17 @@ async function poll() {
     take(await ask("state"));
     if ($("error").dataset.lost) complain("");
   } catch {
-    complain("The server does not answer. Is it still running?", true);
+    complain("The server does not respond. Is it still running?", true);
   }
   setTimeout(poll, ["loading", "moving"].includes(state.phase) ? 300 : 2000);
 }
 
 function take(next) {
-  if (sending) return; // an answer from before the choice
+  if (sending) return; // a response from before the choice
   const other = next.session !== state.session;
   state = { options: [], reveals: [], decisions: [], ...next };
   if (other) {
-    film.clear();
+    player.clear();
     fetched = 0;
     deselect();
   }
@@ -55,10 +55,10 @@ async function fetchClips() {
   try {
     while (session === state.session && fetched < state.reveals.length) {
       const number = fetched;
-      if (!(await film.fetch(session, number, () => session === state.session))) break;
+      if (!(await player.fetch(session, number, () => session === state.session))) break;
       fetched += 1;
       const { start, count } = state.reveals[number];
-      if (count) film.play(Math.max(start - 1, 0), start + count - 1);
+      if (count) player.play(Math.max(start - 1, 0), start + count - 1);
     }
   } catch {
     complain("The frames could not be fetched; trying again.", true);
@@ -82,14 +82,14 @@ async function post(path, message, done = () => {}) {
     done();
     take(next);
   } catch (error) {
-    complain(error.message || "The server does not answer.");
+    complain(error.message || "The server does not respond.");
   }
   sending = false;
 }
 
 // What is seen -----------------------------------------------------------------------------------------------------
 
-const ready = () => state.phase === "choosing" && fetched === state.reveals.length && film.last >= 0;
+const ready = () => state.phase === "choosing" && fetched === state.reveals.length && player.last >= 0;
 
 function render() {
   const { phase } = state;
@@ -131,7 +131,7 @@ function renderOptions() {
   const pointing = ready() && chosen?.needs_point;
   $("frame").classList.toggle("pointing", Boolean(pointing));
   $("hint").textContent = !ready() ? "" : !chosen ? "Watch the clip, then choose."
-    : pointing && !point ? "Click the object in the picture (or move the point with the arrow keys)."
+    : pointing && !point ? "Click the object in the image (or move the point with the arrow keys)."
     : pointing ? `Point: row ${point[0]}, column ${point[1]}.` : "";
 }
 
@@ -146,7 +146,7 @@ function renderClips() {
     const button = element("button", { type: "button", textContent: text, title: clip.title, disabled: !clip.count });
     button.style.flexGrow = Math.max(clip.count, 1);
     if (!number && state.video) button.classList.add("video");
-    button.addEventListener("click", () => film.play(clip.start, clip.start + clip.count - 1));
+    button.addEventListener("click", () => player.play(clip.start, clip.start + clip.count - 1));
     return button;
   });
   $("clips").replaceChildren(...buttons);
@@ -157,14 +157,14 @@ function renderClips() {
     const item = element("li");
     const button = element("button", { type: "button", className: "link", disabled: !clip?.count });
     button.append(element("kbd", { textContent: decision.choice }), ` ${decision.action}${place}${moved}`);
-    button.addEventListener("click", () => film.play(clip.start, clip.start + clip.count - 1));
+    button.addEventListener("click", () => player.play(clip.start, clip.start + clip.count - 1));
     item.append(button);
     return item;
   }));
 }
 
 function showFrame() {
-  const { at, last, playing } = film;
+  const { at, last, playing } = player;
   $("seek").max = Math.max(last, 0);
   $("seek").value = at;
   $("seek").disabled = last < 0;
@@ -225,7 +225,7 @@ function select(option) {
   point = null;
   if (option.needs_point) {
     showPresent();
-    $("picture").focus();
+    $("image").focus();
   }
   render();
 }
@@ -233,8 +233,8 @@ function select(option) {
 const deselect = () => { chosen = point = null; render(); };
 
 function showPresent() {
-  film.pause();
-  film.seek(film.last);
+  player.pause();
+  player.seek(player.last);
 }
 
 function setPoint(row, column) {
@@ -244,20 +244,20 @@ function setPoint(row, column) {
 }
 
 function toggle() {
-  if (film.playing) film.pause();
-  else if (film.at < film.last) film.play(film.at, film.last);
+  if (player.playing) player.pause();
+  else if (player.at < player.last) player.play(player.at, player.last);
   else replay();
 }
 
 function replay() {
-  const clip = state.reveals.findLast((one) => one.start <= film.at && one.count);
-  if (clip) film.play(clip.start, clip.start + clip.count - 1);
+  const clip = state.reveals.findLast((one) => one.start <= player.at && one.count);
+  if (clip) player.play(clip.start, clip.start + clip.count - 1);
 }
 
-$("picture").addEventListener("click", (event) => {
+$("image").addEventListener("click", (event) => {
   if (!ready() || !chosen?.needs_point) return;
-  if (film.at !== film.last) return showPresent(); // what was clicked is not what is there now
-  const box = $("picture").getBoundingClientRect();
+  if (player.at !== player.last) return showPresent(); // what was clicked is not what is there now
+  const box = $("image").getBoundingClientRect();
   setPoint(((event.clientY - box.top) / box.height) * SIDE, ((event.clientX - box.left) / box.width) * SIDE);
 });
 // Set with the mouse, the slider and the speed box give the keys back to the page.
@@ -265,13 +265,13 @@ $("seek").addEventListener("pointerup", () => $("seek").blur());
 $("speed").addEventListener("change", () => { if (!$("speed").matches(":focus-visible")) $("speed").blur(); });
 $("seek").addEventListener("input", () => {
   const at = Number($("seek").value); // read before pausing, which sets the slider to the frame shown
-  film.pause();
-  film.seek(at);
+  player.pause();
+  player.seek(at);
 });
 $("toggle").addEventListener("click", toggle);
 $("replay").addEventListener("click", replay);
 $("present").addEventListener("click", showPresent);
-$("speed").addEventListener("change", () => { film.speed = Number($("speed").value); });
+$("speed").addEventListener("change", () => { player.speed = Number($("speed").value); });
 $("do").addEventListener("click", send);
 $("next").addEventListener("click", () => { complain(""); post("next", {}); });
 
@@ -287,12 +287,12 @@ document.addEventListener("keydown", (event) => {
   if (arrows[event.key]) {
     const [down, right] = arrows[event.key];
     const far = event.shiftKey ? 10 : 1;
-    if (ready() && chosen?.needs_point && film.at === film.last) {
+    if (ready() && chosen?.needs_point && player.at === player.last) {
       const [row, column] = point ?? [SIDE / 2, SIDE / 2];
       setPoint(row + down * far, column + right * far);
     } else if (right) {
-      film.pause();
-      film.seek(film.at + right * far);
+      player.pause();
+      player.seek(player.at + right * far);
     } else return;
   } else if (event.key === "Enter" && !onButton) {
     if (["ended", "broken"].includes(state.phase)) $("next").click();

@@ -1,9 +1,9 @@
 """Training data of the subgoal predictors, from demonstrations.
 
-`python -m mme_vla.subgoal.build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
+`mme-vla subgoal-build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
 
 Writes one JSON-lines file for each set (`simple.jsonl`, `grounded.jsonl`, `memer.jsonl`) in the layout of ms-swift,
-with the pictures and videos beside it; paths in the rows are relative to the output folder. An interrupted run goes on
+with the images and videos beside it; paths in the rows are relative to the output folder. An interrupted run continues
 with the episodes that are missing, and the same input always gives the same files.
 """
 
@@ -17,28 +17,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_values import EpisodeRef
-from mme_vla.data.layout import SAMPLE
-from mme_vla.data.progress import progress
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.errors import UserError, brief
-from mme_vla.files import (
+from mme_vla.subgoal.clips import ENCODING
+from mme_vla.subgoal.finetuning.labels import Labels
+from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
+from mme_vla.utils import (
     SUMS,
     FolderLock,
     claim_plan,
     file_sum,
-    plain,
     read_json,
     remove_drafts,
+    to_json,
     write_atomically,
     write_sums,
 )  # fmt: skip
-from mme_vla.files.media import png_bytes, write_film
-from mme_vla.subgoal.clips import ENCODING
-from mme_vla.subgoal.finetuning.labels import Labels
-from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
+from mme_vla.utils.media import png_bytes, write_video
 
 if TYPE_CHECKING:
     pass
@@ -48,13 +47,13 @@ PARTS = "parts"
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode to build from: its labels, and its front pictures at some frames, both read when asked for."""
+    """One episode to build from: its labels, and its front images at some frames, both read when asked for."""
 
     task: str
     number: int
     origin: str
     labels: Callable[[], Labels]
-    pictures: Callable[[Sequence[int]], Iterator[np.ndarray]]
+    read_images: Callable[[Sequence[int]], Iterator[np.ndarray]]
 
     @property
     def name(self) -> str:
@@ -67,9 +66,6 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
 
     Args:
         tasks: JSON file {"<episode index>": "<Task>"} for a LeRobot dataset that does not tell its tasks.
-
-    Raises:
-        UserError: there is nothing of the kind, or a dataset whose tasks are unknown.
     """
     root = SAMPLE if str(entry) == "sample" else Path(entry)
     if (root / "meta" / "info.json").is_file():
@@ -82,11 +78,7 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
 def build(
     episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions | None = None
 ) -> dict[str, int]:
-    """Build these sets; return the number of rows of each.
-
-    Raises:
-        UserError: no episode, an unknown set, two episodes of one name, or `output` holds something else.
-    """
+    """Build these sets; return the number of rows of each."""
     options = options or RowOptions()
     if not episodes or not sets:
         raise UserError("There is nothing to build: name at least one episode and one of the sets.")
@@ -94,7 +86,7 @@ def build(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
     origins = {episode.name: episode.origin for episode in episodes}
-    plan = plain({"sets": list(sets), "options": asdict(options), "episodes": origins})
+    plan = to_json({"sets": list(sets), "options": asdict(options), "episodes": origins})
     with FolderLock(output, "build of subgoal data"):
         return _build(episodes, output, sets, options, plan)
 
@@ -127,19 +119,19 @@ def _build(
 
 def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], options: RowOptions) -> None:
     labels = episode.labels()
-    wanted: dict[int, list[Path]] = {}
+    paths_at: dict[int, list[Path]] = {}
     for name in sets:
         built = episode_rows(name, labels, options)
         for image, frame in built.images.items():
-            wanted.setdefault(frame, []).append(output / image)
+            paths_at.setdefault(frame, []).append(output / image)
         if built.video:
             _write_once(output / built.video, partial(_write_video, episode, labels.exec_start))
-    missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(wanted.items())}
+    missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(paths_at.items())}
     steps = [t for t, paths in missing.items() if paths]
-    for t, picture in zip(steps, episode.pictures(steps), strict=True):
+    for t, pixels in zip(steps, episode.read_images(steps), strict=True):
         for path in missing[t]:
-            _write_once(path, partial(_write_png, picture))
-    for name in sets:  # the rows last: where they are, their pictures are
+            _write_once(path, partial(_write_png, pixels))
+    for name in sets:  # the rows last: where they are, their images are
         rows = episode_rows(name, labels, options).rows
         with write_atomically(_part(output, name, episode)) as draft:
             draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
@@ -152,12 +144,12 @@ def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def _write_video(episode: Demonstration, length: int, path: Path) -> None:
-    write_film(episode.pictures(range(length)), path, **ENCODING)
+    write_video(episode.read_images(range(length)), path, **ENCODING)
 
 
-def _write_png(picture: np.ndarray, path: Path) -> None:
+def _write_png(image: np.ndarray, path: Path) -> None:
     with write_atomically(path) as draft:
-        draft.write_bytes(png_bytes(picture))
+        draft.write_bytes(png_bytes(image))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:
@@ -178,22 +170,22 @@ def _h5_readers(ref: EpisodeRef) -> tuple[Callable[[], Labels], Callable[[Sequen
                 *episode.joints(),
             )
 
-    def pictures(steps: Sequence[int]) -> Iterator[np.ndarray]:
+    def read_images(steps: Sequence[int]) -> Iterator[np.ndarray]:
         with open_episode(ref) as episode:
             for t in steps:
                 yield episode.front(t)
 
-    return labels, pictures
+    return labels, read_images
 
 
 def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstration]:
     needed = ("simple_subgoal", "grounded_subgoal")
     if lacking := [name for name in needed if name not in source.subgoal_names]:
         raise UserError(f"{source.root} has no column {' and no '.join(lacking)}: nothing to learn subgoals from.")
-    given = {} if tasks is None else _read_tasks(tasks)
-    found = []
+    task_names = {} if tasks is None else _read_tasks(tasks)
+    demonstrations = []
     for e in range(len(source)):
-        task = given.get(str(e)) or source.task(e)
+        task = task_names.get(str(e)) or source.task(e)
         if not task:
             raise UserError(
                 f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
@@ -204,16 +196,16 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
         if type(number) is not int or not 0 <= number < 2**31:
             raise UserError(f"{source.root} gives {brief(number)} as the number of episode {e}; expected a whole one.")
         reader = partial(_lerobot_labels, source, e, task, number)
-        pictures = partial(_lerobot_pictures, source, e)
-        found.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, pictures))
-    return found
+        read_images = partial(_lerobot_images, source, e)
+        demonstrations.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, read_images))
+    return demonstrations
 
 
 def _read_tasks(path: Path) -> dict[str, str]:
-    given: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}', kind=(dict, list))
-    if not isinstance(given, dict) or not all(isinstance(task, str) for task in given.values()):
+    tasks: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}', kind=(dict, list))
+    if not isinstance(tasks, dict) or not all(isinstance(task, str) for task in tasks.values()):
         raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
-    return given
+    return tasks
 
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
@@ -230,6 +222,6 @@ def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int)
     )
 
 
-def _lerobot_pictures(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+def _lerobot_images(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
     for start in range(0, len(steps), 64):  # what is decoded at once stays small
         yield from source.frames(episode, list(steps[start : start + 64]))

@@ -1,6 +1,6 @@
 """Which steps of a demonstration become training rows of the subgoal predictors, and which frames are keyframes.
 
-Everything here is arithmetic on an episode's labels and joint angles; pictures are not looked at (paper, appendix: VLM
+Everything here is arithmetic on an episode's labels and joint angles; images are not looked at (paper, appendix: VLM
 subgoal prediction, and the released builders).
 """
 
@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-STRIDE = 16  # steps a row stands for, as often as a policy asks
+STRIDE = 16  # steps a row means, as often as a policy asks
 _STRIDE = {"StopCube": 32}
 _FIXED = {"PatternLock": 32}  # tasks whose rows follow the clock, not the changes of subgoal
 _STILL = ("PatternLock", "RouteStick")  # tasks in which the arm comes to rest at what matters
@@ -22,7 +22,7 @@ FRAME_STEP, WINDOW = 2, 8  # MemER: every second frame, eight a row
 
 @dataclass(frozen=True)
 class Labels:
-    """What is known of a demonstration without its pictures.
+    """What is known of a demonstration without its images.
 
     task, number: its name and number; goal: in words, lower-case.
     exec_start: first execution frame. simple, grounded: [t] the planner's subgoals, lower-case.
@@ -59,10 +59,10 @@ class Labels:
 
 def without_complete(texts: Sequence[str]) -> list[str]:
     """Replace "complete", which is no subgoal, by the one before it."""
-    kept: list[str] = []
+    result: list[str] = []
     for text in texts:
-        kept.append(kept[-1] if kept and text.strip().lower() == "complete" else text)
-    return kept
+        result.append(result[-1] if result and text.strip().lower() == "complete" else text)
+    return result
 
 
 def changes(labels: Labels) -> list[int]:
@@ -119,12 +119,12 @@ def keyframes(labels: Labels, substring_match: bool = False) -> list[int]:
 def resting_frames(labels: Labels) -> list[int]:
     """Execution frames at which the arm has reached its targets: minima of the distance, at least 5 frames apart."""
     distance = np.linalg.norm(labels.targets - labels.joints, axis=1)
-    found: list[int] = []
+    frames: list[int] = []
     for t in range(max(labels.exec_start, 1), labels.last):
         is_minimum = distance[t] < _AT_REST and distance[t] < distance[t - 1] and distance[t] < distance[t + 1]
-        if is_minimum and (not found or t - found[-1] >= _APART):
-            found.append(t)
-    return found
+        if is_minimum and (not frames or t - frames[-1] >= _APART):
+            frames.append(t)
+    return frames
 
 
 @dataclass(frozen=True)
@@ -136,27 +136,27 @@ class Window:
     positions: list[int]  # from 1
 
 
-def windows(labels: Labels, wanted: Sequence[int], one_a_window: bool = False) -> list[Window]:
+def windows(labels: Labels, targets: Sequence[int], one_a_window: bool = False) -> list[Window]:
     """Cut an episode into MemER's rows.
 
     A keyframe is found at the first looked-at frame within one step of it, and joins the past after its window.
 
     Args:
-        wanted: the keyframes.
+        targets: the keyframes.
         one_a_window: as released, where a second keyframe in one window is missed, and with it all that follow.
     """
-    looked_at = range(labels.exec_start, labels.length, FRAME_STEP)
+    query_steps = range(labels.exec_start, labels.length, FRAME_STEP)
     rows: list[Window] = []
-    waiting, past = list(wanted), list[int]()
-    frames, found = list[int](), list[int]()
-    for i, t in enumerate(looked_at):
+    waiting, past = list(targets), list[int]()
+    frames, matches = list[int](), list[int]()
+    for i, t in enumerate(query_steps):
         frames.append(t)
-        if waiting and abs(t - waiting[0]) <= 1 and not (one_a_window and found):
-            found.append(t)
+        if waiting and abs(t - waiting[0]) <= 1 and not (one_a_window and matches):
+            matches.append(t)
             waiting.pop(0)
         if i % WINDOW == 0 or t >= labels.last - 1:
-            rows.append(Window(list(past), frames, [frames.index(f) + 1 for f in found]))
-            past, frames, found = past + found, [], []
+            rows.append(Window(list(past), frames, [frames.index(f) + 1 for f in matches]))
+            past, frames, matches = past + matches, [], []
     return rows
 
 

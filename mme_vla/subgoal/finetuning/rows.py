@@ -1,30 +1,45 @@
 """Training rows of the subgoal predictors, in the layout of ms-swift: messages, images, videos, objects."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.subgoal.answers import SubgoalHistory
+from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps, windows
-from mme_vla.subgoal.words.parsing import Point, mark_points
-from mme_vla.subgoal.words.prompts import memer_answer, memer_system, memer_user, subgoal_system, subgoal_user
+from mme_vla.subgoal.models.qwen3vl import IMAGE_TOKENS, TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
+from mme_vla.subgoal.text import (
+    BBOX,
+    Point,
+    mark_points,
+    memer_reply,
+    memer_system,
+    memer_user,
+    subgoal_system,
+    subgoal_user,
+    write_boxes,
+)
+from mme_vla.utils import Sums, inside, is_text, read_lines
 
 Row = dict[str, Any]
 SETS = {"simple": ("qwenvl", "simple"), "grounded": ("qwenvl", "grounded"), "memer": ("memer", "grounded")}
 SETS |= {"memer_simple": ("memer", "simple")}
-"""A set's name → (folder of its pictures, kind of subgoal). The paper trains the first three."""
+"""A set's name → (folder of its images, kind of subgoal). The paper trains the first three."""
 
 
 @dataclass(frozen=True)
 class RowOptions:
     """How rows are made.
 
-    noise: lowest and highest integer added to every coordinate, drawn anew for each row; None adds none.
-    repeat_changes: repeat rows at changes of subgoal (as released only while drawing figures).
+    noise: lowest and highest integer added to every coordinate, sampled for each row; None adds none.
+    repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
     short_segments: a row for segments shorter than the stride too (not as released).
     second_keyframe: find a second keyframe in one window (as released it is missed, and all that follow with it).
     substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as released.
@@ -39,17 +54,13 @@ class RowOptions:
     seed: int = 42
 
     def __post_init__(self) -> None:
-        if self.noise is not None:
-            whole = all(isinstance(value, int) for value in self.noise)
-            if not whole or len(self.noise) != 2 or self.noise[0] > self.noise[1]:
-                raise UserError(f"noise={list(self.noise)} must be [lowest, highest] in whole pixels, or null.")
-        if not isinstance(self.seed, int) or self.seed < 0:
-            raise UserError(f"seed={self.seed!r} must be a whole number, 0 or more.")
+        if self.noise is not None and self.noise[0] > self.noise[1]:
+            raise UserError(f"noise={list(self.noise)} must be [lowest, highest] in whole pixels, or null.")
 
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """The rows of one episode in one set, and the pictures they refer to: frames by file name, and the video's name."""
+    """The rows of one episode in one set, and the images they refer to: frames by file name, and the video's name."""
 
     rows: list[Row]
     images: dict[str, int]
@@ -61,9 +72,6 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
 
     Args:
         name: a key of `SETS`.
-
-    Raises:
-        UserError: another name.
     """
     if name not in SETS:
         raise UserError(f"sets: {name!r}. {did_you_mean(str(name), SETS)}")
@@ -78,16 +86,16 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
     for messages, points, frames in build(kind, labels, options):
         names = [f"{stem}_step{t}.png" for t in frames]
         images.update(zip(names, frames, strict=True))
-        system, user, answer = messages
+        system, user, target = messages
         row: Row = {
             "messages": [
                 {"role": "system", "content": system},
                 {"role": "user", "content": user},
-                {"role": "assistant", "content": answer},
+                {"role": "assistant", "content": target},
             ]
         }
         if kind == "grounded":
-            row["objects"] = {"ref": [], "bbox": [_moved(point, options.noise, rng) for point in points]}
+            row["objects"] = {"ref": [], "bbox": [_perturbed(point, options.noise, rng) for point in points]}
         row["images"] = names
         if video:
             row["videos"] = [video]
@@ -102,25 +110,185 @@ def _qwenvl(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
     steps, repeats = selected_steps(labels, options.short_segments)
     history = SubgoalHistory()
     for t in steps:
-        answer, points = mark_points(labels.texts(kind)[t])
+        target, points = mark_points(labels.texts(kind)[t])
         user = subgoal_user(kind, labels.goal, history.entries, video=labels.exec_start > 0)
-        texts = (subgoal_system(kind), user, answer)
+        texts = (subgoal_system(kind), user, target)
         for _ in range(1 + (repeats.get(t, 0) if options.repeat_changes else 0)):
             yield texts, [*history.points, *points], [t]
-        history.add(answer, points)
+        history.add(target, points)
 
 
 def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
-    wanted = keyframes(labels, options.substring_match)
-    for window in windows(labels, wanted, one_a_window=not options.second_keyframe):
+    targets = keyframes(labels, options.substring_match)
+    for window in windows(labels, targets, one_a_window=not options.second_keyframe):
         subtask, points = mark_points(labels.texts(kind)[window.frames[-1]])
         user = memer_user(labels.goal, len(window.past), len(window.frames), video=labels.exec_start > 0)
-        texts = (memer_system(), user, memer_answer(subtask, window.positions))
+        texts = (memer_system(), user, memer_reply(subtask, window.positions))
         yield texts, points, [*window.past, *window.frames]
 
 
-def _moved(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
+def _perturbed(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
     if noise is None:
         return list(point)
     shift = rng.integers(noise[0], noise[1] + 1, 2)
     return np.clip(np.array(point) + shift, 0, SIDE - 1).tolist()
+
+
+IGNORED = -100  # a label that does not count
+_MARKS = 32  # tokens of the conversation's own marks, at most
+_LIMIT = 2**31  # bytes of a file of rows
+_TIME = 12  # tokens of a video frame's time stamp, at most
+
+
+def read_rows(file: str | Path) -> list[Row]:
+    """Read a JSON-lines file."""
+    path = Path(file)
+    if not path.is_file():
+        raise UserError(f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
+    Sums(path.parent, remedy="Build the training data again").check(path.name)
+    rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
+    if not rows:
+        raise UserError(f"{path} holds no row.")
+    return rows
+
+
+def _checked(row: Row) -> Row:
+    if reason := _fault(row):
+        raise UserError(f"no row of training data: {reason}. Build the training data again.")
+    return row
+
+
+def _fault(row: Row) -> str:
+    """What is wrong with a row; empty if nothing is."""
+    messages = row.get("messages")
+    if not isinstance(messages, list) or not all(isinstance(message, dict) for message in messages):
+        return "it has no messages"
+    if [message.get("role") for message in messages] != ["system", "user", "assistant"]:
+        return "expected one message each of system, user and assistant"
+    texts = [message.get("content") for message in messages]
+    if not all(isinstance(text, str) and is_text(text) for text in texts):
+        return "the content of a message is no text"
+    for key in ("images", "videos"):
+        names = row.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            return f"{key} is {brief(names)}, not a list of files"
+    objects = row.get("objects", {})
+    points = objects.get("bbox", []) if isinstance(objects, dict) else None
+    if not isinstance(points, list) or not all(_is_point(point) for point in points):
+        return f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
+    if (marks := texts[1].count(BBOX) + texts[2].count(BBOX)) != len(points):
+        return f"it has {marks} marks {BBOX} for {len(points)} points"
+    return ""
+
+
+def _is_point(point: object) -> bool:
+    return isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
+
+
+def texts_of(row: Row) -> tuple[str, str, str]:
+    """System, user and answer of a row, points written as the model sees them."""
+    system, user, target = (message["content"] for message in row["messages"])
+    points = [(y, x) for y, x in row.get("objects", {}).get("bbox", [])]
+    n_points = user.count(BBOX)
+    return system, write_boxes(user, points[:n_points]), write_boxes(target, points[n_points:])
+
+
+def question_of(row: Row, folder: Path) -> Question:
+    """A row with its images; paths are relative to `folder`."""
+    system, user, target = texts_of(row)
+    images = [read_image(inside(folder, name, "picture")) for name in row.get("images", [])]
+    videos = [Clip.read(inside(folder, name, "video")) for name in row.get("videos", [])]
+    return Question(system, user, images, videos, target)
+
+
+class RowDataset(torch.utils.data.Dataset[Question]):
+    """The rows of a file that are no longer than `max_length` tokens, images read when asked for.
+
+    left_out: how many are longer.
+    """
+
+    def __init__(self, file: str | Path, tokenizer: Any, max_length: int = 3200) -> None:
+        self.folder = Path(file).parent
+        self._sums = Sums(self.folder, remedy="Build the training data again")
+        rows = read_rows(file)
+        example = next((name for row in rows for name in row.get("images", [])), None)
+        if example is None:
+            raise UserError(f"{file} has no row with an image. Build the training data again.")
+        image = _image_tokens(read_image(inside(self.folder, example, "picture")).shape)
+        self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
+        self.left_out = len(rows) - len(self.rows)
+        if not self.rows:
+            raise UserError(f"All rows of {file} are longer than max_length={max_length}; raise it.")
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> Question:
+        row = self.rows[index]
+        for name in (*row.get("images", []), *row.get("videos", [])):
+            self._sums.check(name)
+        return question_of(row, self.folder)
+
+
+class Collator:
+    """Questions with answers → a batch with labels: the answer and its end count, all else is `IGNORED`."""
+
+    def __init__(self, vlm: VLM) -> None:
+        self.vlm = vlm
+        self.start = vlm.processor.tokenizer.encode("<|im_start|>assistant\n", add_special_tokens=False)
+        self.end = vlm.processor.tokenizer.eos_token_id
+
+    def __call__(self, questions: Sequence[Question]) -> dict[str, Any]:
+        batch = dict(self.vlm.encode(questions, side="right"))
+        batch["labels"] = torch.stack([self.labels(ids) for ids in batch["input_ids"]])
+        return batch
+
+    def labels(self, ids: Tensor) -> Tensor:
+        """Labels [n] of one conversation [n]."""
+        listed = ids.tolist()
+        width = len(self.start)
+        starts = [i for i in range(len(listed) - width + 1) if listed[i : i + width] == self.start]
+        first = starts[-1] + width
+        stop = listed.index(self.end, first) + 1
+        labels = torch.full_like(ids, IGNORED)
+        labels[first:stop] = ids[first:stop]
+        return labels
+
+
+def hf_dataset(file: str | Path) -> Any:
+    """A file of rows as a Hugging Face dataset in trl's conversational form.
+
+    Columns: `messages` (role, and content as a list of parts with `type` and `text`), `images` (images, decoded when
+    asked for) and `videos` (absolute paths).
+    """
+    from datasets import Dataset, Features, Image, List, Value
+
+    folder = Path(file).resolve().parent
+    columns: dict[str, list[Any]] = {"messages": [], "images": [], "videos": []}
+    for row in read_rows(file):
+        system, user, target = texts_of(row)
+        messages = Question(system, user, target=target).messages()
+        for message in messages:
+            message["content"] = [{"type": p["type"], "text": p.get("text")} for p in message["content"]]
+        columns["messages"].append(messages)
+        columns["images"].append([str(inside(folder, name, "picture")) for name in row.get("images", [])])
+        columns["videos"].append([str(inside(folder, name, "video")) for name in row.get("videos", [])])
+    part = {"type": Value("string"), "text": Value("string")}
+    features = Features(
+        messages=List({"role": Value("string"), "content": List(part)}),
+        images=List(Image()),
+        videos=List(Value("string")),
+    )
+    return Dataset.from_dict(columns, features=features)
+
+
+def _image_tokens(shape: Sequence[int]) -> int:
+    return min(max(round(shape[0] / TOKEN_SIDE) * round(shape[1] / TOKEN_SIDE), 4), IMAGE_TOKENS)
+
+
+def _longest(row: Row, tokenizer: Any, image: int) -> int:
+    """An upper bound of the row's tokens, without reading its images."""
+    words = sum(len(tokenizer.encode(text, add_special_tokens=False)) for text in texts_of(row))
+    pairs = VIDEO_FRAMES // 2
+    video = pairs * (VIDEO_TOKENS + _TIME + 2)
+    return words + _MARKS + len(row.get("images", [])) * (image + 2) + len(row.get("videos", [])) * video

@@ -1,21 +1,65 @@
 """Fine-tuning a Qwen3-VL subgoal predictor with LoRA, as in the paper.
 
-`python -m mme_vla.subgoal.train rows=<folder>/grounded.jsonl` (several GPUs: `torchrun --nproc-per-node 4 -m …`)
+`mme-vla subgoal-train rows=<folder>/grounded.jsonl` (several GPUs: `torchrun --nproc-per-node 4 -m …`)
 
 The adapter ends up in `<output>/adapter`: `subgoal=qwenvl subgoal.adapter=<output>/adapter` predicts with it.
 """
 
+import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.subgoal.finetuning.examples import Collator, RowDataset
+from mme_vla.subgoal.finetuning.rows import Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+
+MODEL = "Qwen/Qwen3-VL-4B-Instruct"
+ENVIRONMENT = {
+    "IMAGE_MAX_TOKEN_NUM": "256",
+    "VIDEO_MAX_TOKEN_NUM": "64",
+    "FPS_MAX_FRAMES": "10",
+    "QWENVL_BBOX_FORMAT": "legacy",  # points between <|box_start|> and <|box_end|>
+    "NPROC_PER_NODE": "4",
+}
+_ARGUMENTS = {
+    "model": MODEL,
+    "train_type": "lora",  # of ms-swift 3.9 and later 3.x; version 4 calls it tuner_type
+    "lora_rank": 16,
+    "lora_alpha": 32,
+    "target_modules": ["all-linear"],
+    "freeze_vit": True,
+    "freeze_aligner": True,
+    "learning_rate": 1e-4,
+    "warmup_ratio": 0.05,
+    "num_train_epochs": 2,
+    "max_length": 3200,
+    "torch_dtype": "bfloat16",
+    "per_device_train_batch_size": 4,
+    "gradient_accumulation_steps": 4,  # times four GPUs: 64 rows a step; 3 gives the paper's 48
+    "deepspeed": "zero2",
+    "save_steps": 100,
+    "logging_steps": 5,
+}
+
+
+def write_arguments(folder: Path, name: str) -> Path:
+    """Write `swift_<name>.json` beside the rows; run it from that folder: their paths are relative to it."""
+    path = folder / f"swift_{name}.json"
+    arguments = {**_ARGUMENTS, "dataset": [f"{name}.jsonl"], "output_dir": f"swift_{name}"}
+    path.write_text(json.dumps(arguments, indent=1) + "\n")
+    return path
+
+
+def command(name: str) -> str:
+    """The command line that goes with it."""
+    return " ".join([*(f"{key}={value}" for key, value in ENVIRONMENT.items()), "swift sft", f"swift_{name}.json"])
+
 
 # All linear layers of the language model; the vision tower and the merger stay as they are.
 TARGETS = r".*language_model.*\.(q_proj|k_proj|v_proj|o_proj|gate_proj|up_proj|down_proj)"
@@ -31,11 +75,7 @@ ZERO2 = {
 
 
 def accumulation(batch: int, per_device: int, processes: int) -> int:
-    """Batches added up before a step, so that all processes together see `batch` rows.
-
-    Raises:
-        UserError: the numbers do not divide.
-    """
+    """Batches added up before a step, so that all processes together see `batch` rows."""
     together = per_device * processes
     if batch % together:
         raise UserError(
@@ -46,18 +86,14 @@ def accumulation(batch: int, per_device: int, processes: int) -> int:
 
 
 def find_checkpoint(output: Path, resume: str | None) -> str | None:
-    """Where to go on from: a checkpoint's path, or None to start.
-
-    Raises:
-        UserError: `output` holds a run that is not to be resumed, or there is no such checkpoint.
-    """
-    found = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
+    """Where to continue from: a checkpoint's path, or None to start."""
+    checkpoints = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
     if resume is None:
-        if found or (output / ADAPTER).exists():
-            raise UserError(f"{output} holds a run: go on with resume=auto, or choose another output.")
+        if checkpoints or (output / ADAPTER).exists():
+            raise UserError(f"{output} holds a run: continue with resume=auto, or choose another output.")
         return None
     if resume == "auto":
-        return str(found[-1]) if found else None
+        return str(checkpoints[-1]) if checkpoints else None
     if not Path(resume).is_dir():
         raise UserError(f"resume={resume!r}: there is no such checkpoint folder; auto takes the newest of the run.")
     return resume

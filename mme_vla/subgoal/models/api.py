@@ -1,4 +1,4 @@
-"""Questions to a model behind an API: retries, rate limit, time limit, cache of answers, cost. No secret is logged."""
+"""Questions to a model behind an API: retries, rate limit, time limit, cache of replies, cost. No secret is logged."""
 
 import hashlib
 import json
@@ -7,24 +7,68 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.files import read_json, sealed, unsealed
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.models.connection import Connection, Settings, Shown, Turn
-from mme_vla.subgoal.models.google import GoogleConnection
-from mme_vla.subgoal.models.openai_chat import OpenAIConnection
-from mme_vla.subgoal.models.threads import within
+from mme_vla.subgoal.models.connection import (
+    Connection,
+    GoogleConnection,
+    MediaPart,
+    Message,
+    OpenAIConnection,
+    Settings,
+)  # fmt: skip
+from mme_vla.utils import read_json, verified, with_checksum
+
+
+def start[T](call: Callable[[], T]) -> Future[T]:
+    """Begin a call in a daemon thread, which does not keep an interrupted process alive."""
+    future: Future[T] = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=work, name="subgoals", daemon=True).start()
+    return future
+
+
+def side_by_side[A, T](call: Callable[[A], T], items: Sequence[A], workers: int) -> list[T]:
+    """Call with each item, `workers` at a time; the results in the items' order.
+
+    Raises:
+        Exception: of the first item that failed; no further call begins then.
+    """
+    failed = threading.Event()
+
+    def guarded(item: A) -> T | None:
+        if failed.is_set():
+            return None  # the error of an earlier item is raised
+        try:
+            return call(item)
+        except BaseException:
+            failed.set()
+            raise
+
+    if not items:
+        return []
+    with ThreadPool(min(workers, len(items))) as pool:  # daemon threads
+        return cast(list[T], list(pool.imap(guarded, items)))
+
 
 log = logging.getLogger(__name__)
 CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai": OpenAIConnection}
-"""Ways to speak to models, by the word that settings choose them with."""
+"""Clients by the name of their API."""
 
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
@@ -56,7 +100,7 @@ class Api:
     client: what the connection asks, such as google-genai's; None makes one: at once, but with a cache and no key when
         the first question comes that the cache does not hold.
     clock, sleep: of the rate limit and the pauses.
-    speaks: a key of `CONNECTIONS`.
+    provider: a key of `CONNECTIONS`.
     """
 
     settings: Settings
@@ -64,7 +108,7 @@ class Api:
     client: Any = None
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
-    speaks: str = "gemini"
+    provider: str = "gemini"
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _next: float = 0.0
 
@@ -76,33 +120,33 @@ class Api:
     def _connected(self) -> Connection:
         with self._lock:
             if self._connection is None:
-                self._connection = CONNECTIONS[self.speaks](self.settings, self.client)
+                self._connection = CONNECTIONS[self.provider](self.settings, self.client)
             return self._connection
 
     def _needed(self) -> Connection:
         try:
             return self._connected()
         except UserError as error:
-            kept = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
-            raise UserError(f"{error}{kept}") from None
+            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
+            raise UserError(f"{error}{hint}") from None
 
-    def ask(self, system: str, turns: Sequence[Turn]) -> Reply:
+    def ask(self, system: str, messages: Sequence[Message]) -> Reply:
         """Ask the last turn of a conversation.
 
         Raises:
             ApiFailure: no usable answer came, after all tries.
             UserError: the key or the model's name is not accepted.
         """
-        known = self._cache_file(system, turns)
-        if known is not None and (kept := _read_reply(known)) is not None:
+        known = self._cache_file(system, messages)
+        if known is not None and (cached := _read_reply(known)) is not None:
             with self._lock:
                 self.usage.cached += 1
-            return kept
-        reply = self._tried(system, turns)
+            return cached
+        reply = self._tried(system, messages)
         if known is not None:
             known.parent.mkdir(parents=True, exist_ok=True)
             draft = known.with_suffix(f".{uuid.uuid4().hex}.partial")  # other processes may share the folder
-            draft.write_text(json.dumps(sealed(vars(reply))))
+            draft.write_text(json.dumps(with_checksum(vars(reply))))
             try:
                 draft.replace(known)
             except OSError as error:  # a folder in its place: the answer counts, it is only not kept
@@ -110,7 +154,7 @@ class Api:
                 log.warning("%s cannot be written: %s", known, error.strerror)
         return reply
 
-    def _tried(self, system: str, turns: Sequence[Turn]) -> Reply:
+    def _tried(self, system: str, messages: Sequence[Message]) -> Reply:
         connection = self._needed()
         pause = self.settings.backoff
         failure = ApiFailure("failed", "never asked")
@@ -120,9 +164,9 @@ class Api:
                     self.usage.retries += 1
                 self.sleep(min(pause, _LONGEST_PAUSE))
                 pause *= 2
-            self._wait_for_turn()
+            self._wait_for_slot()
             try:
-                return self._once(connection, system, turns)
+                return self._once(connection, system, messages)
             except ApiFailure as error:
                 failure = error
                 if error.problem == "refused":
@@ -140,23 +184,23 @@ class Api:
             log.info("%s: try %d came to nothing (%s)", self.settings.model, attempt + 1, failure)
         raise failure
 
-    def _once(self, connection: Connection, system: str, turns: Sequence[Turn]) -> Reply:
+    def _once(self, connection: Connection, system: str, messages: Sequence[Message]) -> Reply:
         started = self.clock()
-        heard = within(self.settings.timeout, lambda: connection.ask(system, turns))
+        raw = start(lambda: connection.ask(system, messages)).result(self.settings.timeout)
         prices = self.settings.input_price, self.settings.output_price
         with self._lock:
             self.usage.calls += 1
             self.usage.seconds += self.clock() - started
-            self.usage.input_tokens += heard.input_tokens
-            self.usage.output_tokens += heard.output_tokens
-            self.usage.cost += (heard.input_tokens * prices[0] + heard.output_tokens * prices[1]) / 1e6
-        if heard.refusal:
-            raise ApiFailure("refused", self._redacted(heard.refusal, _SECRET))
-        if not (text := self._redacted(heard.text, _SECRET).strip()):
+            self.usage.input_tokens += raw.input_tokens
+            self.usage.output_tokens += raw.output_tokens
+            self.usage.cost += (raw.input_tokens * prices[0] + raw.output_tokens * prices[1]) / 1e6
+        if raw.refusal:
+            raise ApiFailure("refused", self._redacted(raw.refusal, _SECRET))
+        if not (text := self._redacted(raw.text, _SECRET).strip()):
             raise ApiFailure("empty", "the answer is empty")
-        return Reply(text, heard.input_tokens, heard.output_tokens)
+        return Reply(text, raw.input_tokens, raw.output_tokens)
 
-    def _wait_for_turn(self) -> None:
+    def _wait_for_slot(self) -> None:
         if self.settings.requests_per_minute is None:
             return
         with self._lock:
@@ -165,15 +209,15 @@ class Api:
         if (wait := start - self.clock()) > 0:
             self.sleep(wait)
 
-    def _cache_file(self, system: str, turns: Sequence[Turn]) -> Path | None:
+    def _cache_file(self, system: str, messages: Sequence[Message]) -> Path | None:
         if self.settings.cache is None:
             return None
-        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.speaks].cached_as(self.settings), system]).encode())
-        for role, parts in turns:
+        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.provider].cached_as(self.settings), system]).encode())
+        for role, parts in messages:
             digest.update(f"\n{role}".encode())
-            for shown in parts:
-                part = shown.pixels if isinstance(shown, Shown) else shown
-                # The pictures themselves, not their encoding, which may differ between versions of the encoder.
+            for item in parts:
+                part = item.pixels if isinstance(item, MediaPart) else item
+                # The images themselves, not their encoding, which may differ between versions of the encoder.
                 raw = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
                 digest.update(f"\n{getattr(part, 'shape', 'text')} {len(raw)} ".encode() + raw)
         name = digest.hexdigest()
@@ -195,11 +239,11 @@ def _read_reply(path: Path) -> Reply | None:
     if not path.exists() and not path.is_symlink():
         return None
     try:
-        kept = unsealed(read_json(path, "an answer that was kept"), str(path))
-        counts: list[Any] = [kept.get("input_tokens"), kept.get("output_tokens")]
-        if not isinstance(kept.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
+        stored = verified(read_json(path, "an answer that was kept"), str(path))
+        counts: list[Any] = [stored.get("input_tokens"), stored.get("output_tokens")]
+        if not isinstance(stored.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
             raise UserError(f"{path} lacks a text and two numbers of tokens")
-        return Reply(kept["text"], *counts)
+        return Reply(stored["text"], *counts)
     except UserError as error:
         log.warning("%s The question is asked again.", error)
         return None
@@ -217,15 +261,12 @@ def _code(error: Exception) -> int:
     return next((code for code in codes if isinstance(code, int) and code), 0)
 
 
-def make_api(speaks: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
+def make_api(provider: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
     """An `Api` out of plain settings.
 
     Args:
-        speaks: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
-
-    Raises:
-        UserError: an unknown way, key or value; no key, or a package that is not installed.
+        provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
     """
-    if speaks not in CONNECTIONS:
-        raise UserError(f"{where}.api={speaks!r}. {did_you_mean(str(speaks), CONNECTIONS)}")
-    return Api(read_section(CONNECTIONS[speaks].settings_type, settings, where), usage, client, speaks=speaks)
+    if provider not in CONNECTIONS:
+        raise UserError(f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
+    return Api(read_section(CONNECTIONS[provider].settings_type, settings, where), usage, client, provider=provider)

@@ -1,17 +1,22 @@
-"""What a model behind an API is asked through: its settings, what a conversation is made of, what comes back."""
+"""Clients of models behind an API: google-genai, and OpenAI's chat completions, which vLLM and Ollama serve too."""
 
-import math
+import base64
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from functools import partial
+from typing import Annotated, Any, ClassVar
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, Range
+from mme_vla.errors import UserError, missing_extra
+from mme_vla.subgoal.clips import ENCODING, sample_video
+from mme_vla.utils.media import png_bytes, video_bytes
 
-Turn = tuple[str, list[Any]]
-"""Role (`user` or `model`); parts: texts, pictures [H, W, 3], videos [t, H, W, 3], bare or as `Shown`."""
+Message = tuple[str, list[Any]]
+"""Role (`user` or `model`); parts: texts, images [H, W, 3], videos [t, H, W, 3], bare or as `Shown`."""
 
 
 @dataclass(frozen=True)
@@ -22,31 +27,20 @@ class Settings:
     temperature: 0 for the likeliest answer; None for models that take none.
     timeout: seconds before an answer is given up.
     retries: further tries after a passing error. backoff: seconds before the first of them, doubled each time.
-    requests_per_minute: rate limit; None for none. cache: folder of answers; None keeps none.
+    requests_per_minute: rate limit; None for none. cache: folder of replies; None keeps none.
     input_price, output_price: US dollars for a million tokens.
     """
 
     model: str = "gemini-2.5-pro"
     key_variable: str | None = "GEMINI_API_KEY"
-    temperature: float | None = 0.0
-    timeout: float = 120.0
-    retries: int = 5
-    backoff: float = 2.0
-    requests_per_minute: float | None = 60
+    temperature: NonNegative | None = 0.0
+    timeout: Positive = 120.0
+    retries: NonNegativeInt = 5
+    backoff: NonNegative = 2.0
+    requests_per_minute: Positive | None = 60
     cache: str | None = None
-    input_price: float = 1.25
-    output_price: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name, wanted in _WANTED.items():
-            value = getattr(self, name)
-            if value is None and "null" in wanted:
-                continue
-            usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not usable or value < 0 or (value == 0 and "above" in wanted):
-                raise UserError(f"{name}={value!r} must be {wanted}.")
-        if not isinstance(self.retries, int):
-            raise UserError(f"retries={self.retries!r} must be a whole number, 0 or more.")
+    input_price: NonNegative = 1.25
+    output_price: NonNegative = 10.0
 
     @property
     def key(self) -> str:
@@ -59,20 +53,9 @@ class Settings:
         return [self.key] if self.key else []
 
 
-_WANTED = {
-    "temperature": "a number, 0 or more, or null for models that take none",
-    "timeout": "a number of seconds above 0",
-    "retries": "a whole number, 0 or more",
-    "backoff": "a number of seconds, 0 or more",
-    "requests_per_minute": "a number above 0, or null for no limit",
-    "input_price": "a number of dollars, 0 or more",
-    "output_price": "a number of dollars, 0 or more",
-}
-
-
 @dataclass
-class Shown:
-    """A picture [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
+class MediaPart:
+    """An image [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
 
     pixels: np.ndarray
     _encoded: dict[str, Any] = field(default_factory=dict)
@@ -81,12 +64,12 @@ class Shown:
         """What is sent in this form."""
         if form not in self._encoded:
             self._encoded[form] = encode(self.pixels)
-        found: T = self._encoded[form]
-        return found
+        encoded: T = self._encoded[form]
+        return encoded
 
 
 @dataclass(frozen=True)
-class Heard:
+class RawReply:
     """What an API answered. refusal: why the model would not answer, empty if it did. Thoughts count as output."""
 
     text: str
@@ -96,14 +79,11 @@ class Heard:
 
 
 class Connection:
-    """One way to speak to models. A subclass says how it is set, and asks.
+    """A client of an API. A subclass has a type of settings, and `ask`.
 
     Args:
         settings: of its own kind.
         client: what the questions go to; None makes one.
-
-    Raises:
-        UserError: there is no key, or the client's package is not installed.
     """
 
     settings_type: ClassVar[type[Settings]] = Settings
@@ -111,7 +91,7 @@ class Connection:
     def __init__(self, settings: Any, client: Any = None) -> None:
         raise NotImplementedError
 
-    def ask(self, system: str, turns: Sequence[Turn]) -> Heard:
+    def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
         """Ask the last turn of a conversation, once; whatever goes wrong is raised as the client raises it."""
         raise NotImplementedError
 
@@ -124,3 +104,199 @@ class Connection:
 def count(used: Any, name: str) -> int:
     """A number of tokens, 0 where an API does not say."""
     return int(getattr(used, name, None) or 0)
+
+
+class GoogleConnection(Connection):
+    """Google's API.
+
+    client: an object with `models.generate_content(model=, contents=, config=)`, as google-genai's.
+    """
+
+    def __init__(self, settings: Settings, client: Any = None) -> None:
+        self._settings, self._client = settings, client or _google_client(settings)
+
+    def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
+        """See `Connection`."""
+        response = self._client.models.generate_content(
+            model=self._settings.model,
+            contents=[{"role": role, "parts": [_part(part) for part in parts]} for role, parts in messages],
+            config={"system_instruction": system, "temperature": self._settings.temperature},
+        )
+        used = getattr(response, "usage_metadata", None)
+        n_output = count(used, "candidates_token_count") + count(used, "thoughts_token_count")
+        text = getattr(response, "text", None) or ""
+        return RawReply(text, count(used, "prompt_token_count"), n_output, _refusal(response))
+
+
+def _google_client(settings: Settings) -> Any:
+    if not settings.key:
+        raise UserError(f"Gemini needs a key in the environment variable {settings.key_variable}.")
+    try:
+        from google import genai
+    except ImportError:
+        raise missing_extra("Gemini", "gemini") from None
+    return genai.Client(api_key=settings.key, http_options={"timeout": int(settings.timeout * 1000)})
+
+
+def _part(part: Any) -> Mapping[str, Any]:
+    if isinstance(part, str):
+        return {"text": part}
+    return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", _inline)
+
+
+def _inline(pixels: np.ndarray) -> Mapping[str, Any]:
+    is_image = pixels.ndim == 3
+    data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
+    return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
+
+
+def _refusal(response: Any) -> str:
+    """Why the model refused to answer, empty if it did not."""
+    blocked = getattr(getattr(response, "prompt_feedback", None), "block_reason", None)
+    if blocked:
+        return f"the question was blocked: {_name(blocked)}"
+    candidates = getattr(response, "candidates", None) or []
+    reason = _name(getattr(candidates[0], "finish_reason", None)) if candidates else ""
+    return f"the answer was stopped: {reason}" if reason not in ("", "STOP", "MAX_TOKENS") else ""
+
+
+def _name(value: Any) -> str:
+    return "" if value is None else str(getattr(value, "name", value))
+
+
+@dataclass(frozen=True)
+class OpenAISettings(Settings):
+    """As `Settings`, for OpenAI's chat completions.
+
+    base_url: of the endpoint, such as http://127.0.0.1:8000/v1; None for OpenAI's own.
+    video_frames: images sent in place of a video, which these endpoints do not take; even, 2 or more.
+    """
+
+    model: str = "gpt-5-mini"
+    key_variable: str | None = "OPENAI_API_KEY"
+    temperature: NonNegative | None = None
+    input_price: NonNegative = 0.0
+    output_price: NonNegative = 0.0
+    base_url: str | None = None
+    video_frames: Annotated[int, Range(least=2)] = 10
+
+    def __post_init__(self) -> None:
+        if self.video_frames % 2:
+            raise UserError(f"video_frames={self.video_frames} must be an even number of images, 2 or more.")
+        if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
+            shown = self.base_url.rpartition("@")[2]  # without a password
+            raise UserError(f"base_url={shown!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
+
+    @property
+    def login(self) -> str:
+        """`user:password` of an address that has them, else empty."""
+        address = urlsplit(self.base_url or "")
+        if not (address.username or address.password):
+            return ""
+        return f"{unquote(address.username or '')}:{unquote(address.password or '')}"
+
+    @property
+    def secrets(self) -> list[str]:
+        """See `Settings`; the password of an address is one too, and its base64, as which it is sent."""
+        login = self.login
+        return [*super().secrets, *filter(None, (login, _base64(login), login.partition(":")[2]))]
+
+
+class OpenAIConnection(Connection):
+    """OpenAI's chat completions; a video is sent as images out of it.
+
+    client: an object with `chat.completions.create(model=, messages=, …)`, as openai's.
+    """
+
+    settings_type = OpenAISettings
+
+    def __init__(self, settings: OpenAISettings, client: Any = None) -> None:
+        self._settings, self._client = settings, client or _openai_client(settings)
+
+    def ask(self, system: str, conversation: Sequence[Message]) -> RawReply:
+        """See `Connection`."""
+        messages: list[dict[str, Any]] = [{"role": "system", "content": system}]
+        messages += [
+            {"role": "assistant" if role == "model" else role, "content": self._content(role, parts)}
+            for role, parts in conversation
+        ]
+        temperature = self._settings.temperature
+        response = self._client.chat.completions.create(
+            model=self._settings.model,
+            messages=messages,
+            **({} if temperature is None else {"temperature": temperature}),
+        )
+        used = getattr(response, "usage", None)
+        read, n_output = count(used, "prompt_tokens"), count(used, "completion_tokens")
+        if not (choices := getattr(response, "choices", None)):
+            return RawReply("", read, n_output)
+        message = choices[0].message
+        refusal = getattr(message, "refusal", None) or ""
+        if choices[0].finish_reason == "content_filter":
+            refusal = refusal or "the answer was stopped: content_filter"
+        return RawReply(getattr(message, "content", None) or "", read, n_output, refusal)
+
+    def _content(self, role: str, parts: Sequence[Any]) -> Any:
+        if role == "model":
+            return "".join(parts)  # many servers take an assistant's words as a text alone
+        return [piece for part in parts for piece in self._pieces(part)]
+
+    def _pieces(self, part: Any) -> list[dict[str, Any]]:
+        if isinstance(part, str):
+            return [{"type": "text", "text": part}]
+        most = self._settings.video_frames
+        return (part if isinstance(part, MediaPart) else MediaPart(part)).once(
+            f"openai {most}", partial(_image_parts, most=most)
+        )
+
+    @staticmethod
+    def cached_as(settings: OpenAISettings) -> list[Any]:
+        """See `Connection`; where the endpoint is does not count, as another machine may have it elsewhere."""
+        return [settings.model, settings.temperature, "openai", settings.video_frames]
+
+
+def _openai_client(settings: OpenAISettings) -> Any:
+    if settings.key_variable is not None and not settings.key:
+        raise UserError(
+            f"{settings.model} needs a key in the environment variable {settings.key_variable}; an endpoint that asks "
+            "for none has key_variable=null."
+        )
+    try:
+        import openai
+    except ImportError:
+        raise missing_extra("An OpenAI-compatible endpoint", "openai") from None
+    # The client's errors and logs name its address: the login travels in a header instead.
+    address = urlsplit(settings.base_url or "")
+    address = address._replace(netloc=address.netloc.rpartition("@")[2])
+    # Tries are counted, and waited between, by `Api`.
+    return openai.OpenAI(
+        api_key=settings.key or "none",
+        base_url=address.geturl() or None,
+        default_headers={"Authorization": f"Basic {_base64(settings.login)}"} if settings.login else None,
+        timeout=settings.timeout,
+        max_retries=0,
+    )
+
+
+def _scheme(address: str) -> str:
+    try:
+        return urlsplit(address).scheme
+    except ValueError:  # brackets that hold no address
+        return ""
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode("ascii")
+
+
+def _image_parts(pixels: np.ndarray, most: int) -> list[dict[str, Any]]:
+    if pixels.ndim == 3:
+        return [_image_part(pixels)]
+    places = sample_video(len(pixels), most=most)
+    caption = f"A video of {len(pixels)} frames; {len(places)} of them in order:"
+    return [{"type": "text", "text": caption}, *(_image_part(pixels[i]) for i in places)]
+
+
+def _image_part(pixels: np.ndarray) -> dict[str, Any]:
+    data = base64.b64encode(png_bytes(pixels)).decode("ascii")
+    return {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{data}"}}

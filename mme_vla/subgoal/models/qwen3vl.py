@@ -1,4 +1,4 @@
-"""Qwen3-VL through transformers: questions with pictures and videos in, answers out, in batches."""
+"""Qwen3-VL through transformers: questions with images and videos in, completions out, in batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ import torch
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean, missing_extra
-from mme_vla.files.media import FPS
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.tiny import make_tiny
-from mme_vla.subgoal.words.prompts import IMAGE, VIDEO, split_media
+from mme_vla.subgoal.text import IMAGE, VIDEO, split_media
+from mme_vla.utils.media import FPS
 
-IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: a picture; a video frame
+IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: an image; a video frame
 TOKEN_SIDE = 32  # pixels of a token: patches of 16, merged 2×2
 TINY = "tiny"
 DTYPES = ("float32", "bfloat16", "float16")
@@ -25,30 +25,30 @@ DTYPES = ("float32", "bfloat16", "float16")
 class Question:
     """One question.
 
-    system, user: texts; `<image>` and `<video>` in the user's mark where pictures go.
+    system, user: texts; `<image>` and `<video>` in the user's mark where images go.
     images: [H, W, 3] uint8 each. videos: what is looked at of each.
-    answer: what the model is to learn to say; None where it is asked.
+    target: what the model is to learn to say; None where it is asked.
     """
 
     system: str
     user: str
     images: list[np.ndarray] = field(default_factory=list)
     videos: list[Clip] = field(default_factory=list)
-    answer: str | None = None
+    target: str | None = None
 
     def messages(self) -> list[dict[str, Any]]:
         """The conversation in the form of chat templates."""
         kinds = {IMAGE: {"type": "image"}, VIDEO: {"type": "video"}}
         parts = [kinds.get(piece, {"type": "text", "text": piece}) for piece in split_media(self.user)]
-        said = [{"role": "system", "content": [{"type": "text", "text": self.system}]}]
-        said.append({"role": "user", "content": parts})
-        if self.answer is not None:
-            said.append({"role": "assistant", "content": [{"type": "text", "text": self.answer}]})
-        return said
+        messages = [{"role": "system", "content": [{"type": "text", "text": self.system}]}]
+        messages.append({"role": "user", "content": parts})
+        if self.target is not None:
+            messages.append({"role": "assistant", "content": [{"type": "text", "text": self.target}]})
+        return messages
 
 
 @dataclass(frozen=True)
-class Answer:
+class Completion:
     """What the model said, special tokens of points kept; and the tokens it read and wrote."""
 
     text: str
@@ -65,7 +65,7 @@ class VLM:
     def __init__(self, model: Any, processor: Any, batch_size: int = 8) -> None:
         _check_batch(batch_size)
         self.model, self.processor, self.batch_size = model, processor, batch_size
-        limit_pictures(processor)
+        limit_images(processor)
 
     @classmethod
     def load(
@@ -84,9 +84,6 @@ class VLM:
             adapter: folder or repository of a LoRA adapter (PEFT); ms-swift's checkpoints are such.
             device: `auto` (a GPU where there is one), `cpu`, `cuda`, `cuda:1`, …
             dtype: of the weights, one of `DTYPES`.
-
-        Raises:
-            UserError: the extra `vlm` is not installed, nothing loadable is there, or an option cannot work.
         """
         _check_batch(batch_size)
         place = find_device(device)  # before the minutes that loading may take
@@ -103,15 +100,15 @@ class VLM:
     def encode(self, questions: Sequence[Question], side: str = "left") -> Any:
         """Token ids, masks and pixels of a batch, padded on `side`."""
         texts = [
-            self.processor.apply_chat_template(q.messages(), tokenize=False, add_generation_prompt=q.answer is None)
+            self.processor.apply_chat_template(q.messages(), tokenize=False, add_generation_prompt=q.target is None)
             for q in questions
         ]
         images = [image for q in questions for image in q.images]
         videos = [video for q in questions for video in q.videos]
-        given: dict[str, Any] = {"images": images} if images else {}
+        options: dict[str, Any] = {"images": images} if images else {}
         if videos:
-            given["videos"] = [video.frames for video in videos]
-            given["video_metadata"] = [
+            options["videos"] = [video.frames for video in videos]
+            options["video_metadata"] = [
                 {
                     "total_num_frames": video.length,
                     "fps": FPS,
@@ -120,38 +117,34 @@ class VLM:
                 }
                 for video in videos
             ]
-            given["do_sample_frames"] = False
-        return self.processor(text=texts, padding=True, padding_side=side, return_tensors="pt", **given)
+            options["do_sample_frames"] = False
+        return self.processor(text=texts, padding=True, padding_side=side, return_tensors="pt", **options)
 
     @torch.inference_mode()
-    def generate(self, questions: Sequence[Question], max_new_tokens: int = 128) -> list[Answer]:
+    def generate(self, questions: Sequence[Question], max_new_tokens: int = 128) -> list[Completion]:
         """Answer greedily. What is asked together does not change an answer beyond rounding."""
-        answers: list[Answer] = []
+        completions: list[Completion] = []
         for start in range(0, len(questions), self.batch_size):
             batch = self.encode(questions[start : start + self.batch_size]).to(self.model.device)
-            said = self.model.generate(
+            sequences = self.model.generate(
                 **batch, max_new_tokens=max_new_tokens, do_sample=False, temperature=None, top_p=None, top_k=None
             )
             read = batch["attention_mask"].sum(1).tolist()
-            answers += [
-                self._answer(ids, n) for ids, n in zip(said[:, batch["input_ids"].shape[1] :], read, strict=True)
+            completions += [
+                self._reply(ids, n) for ids, n in zip(sequences[:, batch["input_ids"].shape[1] :], read, strict=True)
             ]
-        return answers
+        return completions
 
-    def _answer(self, ids: torch.Tensor, read: int) -> Answer:
+    def _reply(self, ids: torch.Tensor, read: int) -> Completion:
         tokenizer = self.processor.tokenizer
         ends = {tokenizer.eos_token_id, tokenizer.pad_token_id}
-        written = [token for token in ids.tolist() if token not in ends]
+        tokens = [token for token in ids.tolist() if token not in ends]
         # The marks of points are special tokens and must stay.
-        return Answer(tokenizer.decode(written, skip_special_tokens=False).strip(), read, len(written))
+        return Completion(tokenizer.decode(tokens, skip_special_tokens=False).strip(), read, len(tokens))
 
 
 def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
-    """A model and its processor, on the CPU.
-
-    Raises:
-        UserError: the extra `vlm` is not installed, or there is no such model or dtype.
-    """
+    """A model and its processor, on the CPU."""
     if dtype not in DTYPES:
         raise UserError(f"dtype={dtype!r} of a Qwen3-VL. {did_you_mean(str(dtype), DTYPES)}")
     try:
@@ -173,8 +166,8 @@ def _check_batch(size: int) -> None:
         raise UserError(f"batch_size={size!r} must be a whole number, 1 or more.")
 
 
-def limit_pictures(processor: Any) -> None:
-    """Hold pictures and videos to the released limits; nothing of 256×256 pixels is resized by them."""
+def limit_images(processor: Any) -> None:
+    """Hold images and videos to the released limits; nothing of 256×256 pixels is resized by them."""
     area = TOKEN_SIDE**2
     processor.image_processor.size = {"shortest_edge": 4 * area, "longest_edge": IMAGE_TOKENS * area}
     processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": VIDEO_FRAMES * VIDEO_TOKENS * area}

@@ -1,9 +1,9 @@
 """The released (JAX) names of the backbone's tensors. VLM leaves have no suffix, the action expert's end in `_1`."""
 
-from mme_vla.backbone.pi05.backbone import Pi05Backbone
-from mme_vla.backbone.pi05.gemma import ExpertLayer
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
-from mme_vla.weights.name_tables import NameTable, Piece, Unread, linear, prefixed
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.gemma import ExpertLayer
+from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.weights.tables import NameTable, Piece, Unread, linear, prefixed
 
 LAYERS = "PaliGemma/llm/layers"
 SUFFIX = {"vlm": "", "action": "_1", "memory": "_mem"}
@@ -20,9 +20,9 @@ def released_names(backbone: Pi05Backbone) -> NameTable:
             names = _expert_layer(backbone.config, layer, SUFFIX[expert], i)
             table |= prefixed(f"transformer.layers.{i}.experts.{expert}", names)
     table |= prefixed("transformer.final_norm.dense", linear("PaliGemma/llm/final_norm_1/Dense_0"))
-    for ours, theirs in (("action_in", "action_in_proj"), ("action_out", "action_out_proj"),
+    for target, source in (("action_in", "action_in_proj"), ("action_out", "action_out_proj"),
                          ("time_in", "time_mlp_in"), ("time_out", "time_mlp_out")):  # fmt: skip
-        table |= prefixed(ours, linear(theirs))
+        table |= prefixed(target, linear(source))
     return table
 
 
@@ -31,7 +31,7 @@ def released_unread(backbone: Pi05Backbone) -> list[Unread]:
     config, experts = backbone.config, backbone.transformer.experts
     gaps = []
     for name, expert in experts.items():
-        if name in SUFFIX and name != backbone.transformer.answering:
+        if name in SUFFIX and name != backbone.transformer.action_expert:
             gaps.append(Unread(f"PaliGemma/llm/final_norm{SUFFIX[name]}/scale", (expert.width,)))
             gaps += _unread_layer(config, expert, SUFFIX[name])
     return gaps
@@ -45,10 +45,10 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, suffix: str, i: in
     kv_axes = {"two": 2, "k": config.num_kv_heads, "h": config.head_dim}
     kv = Piece(f"{LAYERS}/attn/kv_einsum{suffix}/w", "two k d h -> (two k h) d", kv_axes, i)
 
-    def norm(ours: str, theirs: str) -> NameTable:
+    def norm(target: str, source: str) -> NameTable:
         if suffix == "_1":
-            return prefixed(f"{ours}.dense", linear(f"{LAYERS}/{theirs}_1/Dense_0", layer=i))
-        return {f"{ours}.scale": [Piece(f"{LAYERS}/{theirs}{suffix}/scale", layer=i)]}
+            return prefixed(f"{target}.dense", linear(f"{LAYERS}/{source}_1/Dense_0", layer=i))
+        return {f"{target}.scale": [Piece(f"{LAYERS}/{source}{suffix}/scale", layer=i)]}
 
     table = norm("attention_norm", "pre_attention_norm")
     if layer.keys_only:

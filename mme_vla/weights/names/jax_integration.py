@@ -2,7 +2,7 @@
 
 from mme_vla.integration.base import Integration
 from mme_vla.integration.modulator import Modulator, ModulatorLayer
-from mme_vla.weights.name_tables import NameTable, Piece, linear, prefixed
+from mme_vla.weights.tables import NameTable, Piece, linear, prefixed
 
 LAYERS = "PaliGemma/llm/layers"
 

@@ -4,11 +4,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.memory.base import Memory
-from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.memory.rmt import RMTLayer, angles
 from mme_vla.memory.ttt import TTTLayer
-from mme_vla.weights.name_tables import Derived, NameTable, Piece, Unread, linear, prefixed
+from mme_vla.weights.tables import Derived, NameTable, Piece, Unread, linear, prefixed
 
 ENCODER = "mem_encoder/feature_encoder"
 LAYER = "mem_encoder/recur_layer"
@@ -56,11 +56,16 @@ def rotary_table(positions: int, head_dim: int) -> Tensor:
 def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
     """The table of a recurrent layer that sits at `root` in the released tree."""
 
-    def norm(ours: str, theirs: str) -> NameTable:
-        return {f"{ours}.weight": [Piece(f"{root}/{theirs}/scale")], f"{ours}.bias": [Piece(f"{root}/{theirs}/bias")]}
+    def norm(target: str, source: str) -> NameTable:
+        return {
+            f"{target}.weight": [Piece(f"{root}/{source}/scale")],
+            f"{target}.bias": [Piece(f"{root}/{source}/bias")],
+        }
 
     def kernels(names: dict[str, str]) -> NameTable:
-        return {f"{ours}.weight": [Piece(f"{root}/{theirs}/kernel", "i o -> o i")] for ours, theirs in names.items()}
+        return {
+            f"{target}.weight": [Piece(f"{root}/{source}/kernel", "i o -> o i")] for target, source in names.items()
+        }
 
     if isinstance(layer, TTTLayer):
         table = kernels({"q": "wq", "k": "wk", "v": "wv", "out": "wo"})

@@ -4,11 +4,11 @@ They follow transformers' modules as of 4.52, without LeRobot's leading `model.`
 q, k and v, and gate and up, which here are apart. An expert that integrates memory has no names in these formats.
 """
 
-from mme_vla.backbone.layers.norms import AdaRMSNorm
-from mme_vla.backbone.pi05.backbone import Pi05Backbone
-from mme_vla.backbone.pi05.gemma import ExpertLayer
-from mme_vla.backbone.pi05.sizes import BackboneConfig, VisionConfig
-from mme_vla.weights.name_tables import NameTable, Piece, Unread, prefixed
+from mme_vla.backbone.config import BackboneConfig, VisionConfig
+from mme_vla.backbone.gemma import ExpertLayer
+from mme_vla.backbone.layers import AdaRMSNorm
+from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.weights.tables import NameTable, Piece, Unread, prefixed
 
 ROOT = "paligemma_with_expert"
 VISION = f"{ROOT}.paligemma.model.vision_tower.vision_model"
@@ -38,8 +38,8 @@ def torch_names(backbone: Pi05Backbone) -> NameTable:
             names = _expert_layer(backbone.config, layer, f"{root}.layers.{i}")
             table |= prefixed(f"transformer.layers.{i}.experts.{expert}", names)
     table |= prefixed("transformer.final_norm.dense", _affine(f"{EXPERTS['action']}.norm.dense"))
-    for ours, theirs in HEADS.items():
-        table |= prefixed(ours, _affine(theirs))
+    for target, source in HEADS.items():
+        table |= prefixed(target, _affine(source))
     return table
 
 
@@ -68,10 +68,10 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, root: str) -> Name
     def rows(name: str, heads: int) -> Piece:
         return Piece(f"{root}.self_attn.{name}.weight", "(n h) d -> (n h) d", {"n": heads, "h": config.head_dim})
 
-    def norm(ours: str, module: object, theirs: str) -> NameTable:
+    def norm(target: str, module: object, source: str) -> NameTable:
         if isinstance(module, AdaRMSNorm):
-            return prefixed(f"{ours}.dense", _affine(f"{root}.{theirs}.dense"))
-        return {f"{ours}.scale": [Piece(f"{root}.{theirs}.weight")]}
+            return prefixed(f"{target}.dense", _affine(f"{root}.{source}.dense"))
+        return {f"{target}.scale": [Piece(f"{root}.{source}.weight")]}
 
     kv = [rows("k_proj", config.num_kv_heads), rows("v_proj", config.num_kv_heads)]
     table = norm("attention_norm", layer.attention_norm, "input_layernorm")

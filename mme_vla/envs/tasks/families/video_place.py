@@ -5,26 +5,18 @@ from typing import TYPE_CHECKING, ClassVar
 
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Swap
-from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
-from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import (
-    StaticFor,
-    any_picked_up,
-    dropped,
-    dropped_onto,
-    picked_up,
-    pressed,
-    reset_reached,
-)
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, Swap, under
+from mme_vla.envs.scene.objects import Cube, Disc, H, build_disc
+from mme_vla.envs.scene.placement import Avoid, Draws, Region, SceneError, draw_button, draw_disc
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, dropped_onto
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
+from mme_vla.envs.tasks.families.stages import add_cube, end_video, go_home, pick, press, wait
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    pass
+
 
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TARGET_RADIUS = 0.04
@@ -54,10 +46,7 @@ class VideoPlace(Task):
         avoid: list[Avoid] = [self.spot, self.button]
         self.cubes: list[Cube] = []
         for colour in colours:
-            place = draw_cube(draws, Region((0, 0), 0.2), avoid, gap=H)
-            if place is None:
-                raise SceneError(f"{type(self).__name__}, seed {self.seed}: the {colour} cube finds no place.")
-            self.cubes.append(self.add(build_cube(self, f"cube_{colour}", colour, *place)))
+            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, Region((0, 0), 0.2), avoid))
             avoid.append(self.cubes[-1])
         self.targets: list[Disc] = []
         for i in range(self.target_counts[self.difficulty]):
@@ -74,7 +63,7 @@ class VideoPlace(Task):
 
     @abstractmethod
     def draw_script(self, draws: Draws) -> None:
-        """Draw what the video shows and what is asked for."""
+        """Sample what the video shows and where the cube belongs."""
 
     @abstractmethod
     def visits(self) -> list[SubTask]:
@@ -105,10 +94,7 @@ class VideoPlace(Task):
         return False
 
     def subtasks(self) -> list[SubTask]:
-        rest = GO_HOME_STEPS + self.turned("delay")
-        self._swap_stage = SubTask(
-            "static", StaticFor(self, SWAP_STAGE_STEPS), lambda demo: demo.hold(SWAP_STAGE_STEPS), video=True
-        )
+        self._swap_stage = wait(self, SWAP_STAGE_STEPS)
         after = [
             self.show_pick(),
             SubTask(
@@ -117,32 +103,15 @@ class VideoPlace(Task):
                 run=lambda demo: demo.place_on(self.spot, TABLE_Z),
                 video=True,
             ),
-            SubTask("static", StaticFor(self, rest), lambda demo: self._go_home(demo, rest), video=True),
+            go_home(self, GO_HOME_STEPS + self.turned("delay")),
             self._swap_stage,
-            SubTask(
-                NO_RECORD,
-                done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
-                run=lambda demo: demo.hard_reset(),
-                video=True,
-            ),
+            end_video(self),
         ]
         return [*self.visits(), *after, *self._execution()]
 
-    @staticmethod
-    def _go_home(demo: "Demonstrator", steps: int) -> None:
-        demo.go_home()
-        demo.hold(steps)
-
     def show_pick(self) -> SubTask:
         """The video's picking up of the cube."""
-        return SubTask(
-            "pick up the cube",
-            done=lambda: picked_up(self, self.cube),
-            run=lambda demo: demo.pick(self.cube),
-            targets=[self.cube],
-            choice="a",
-            video=True,
-        )
+        return pick(self, self.cube, "pick up the cube", grounded="", video=True)
 
     def show_drop(self, target: Disc) -> SubTask:
         """The video's dropping of the cube on a target."""
@@ -157,30 +126,14 @@ class VideoPlace(Task):
 
     def show_press(self) -> SubTask:
         """The video's press of the button."""
-        return SubTask(
-            "press the button",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            targets=[self.button],
-            choice="c",
-            video=True,
-        )
+        return press(self.button, "press the button", "c", grounded="", video=True)
 
     def _execution(self) -> list[SubTask]:
         cube, target = self.cube, self.goal_target
         other_cubes = [c for c in self.cubes if c is not cube]
         other_targets = [t for t in self.targets if t is not target]
         return [
-            SubTask(
-                "pick up the cube",
-                done=lambda: picked_up(self, cube),
-                run=lambda demo: demo.pick(cube),
-                grounded="pick up the cube at <>",
-                failed=lambda: any_picked_up(self, other_cubes),
-                targets=[cube],
-                choice="a",
-                pick=True,
-            ),
+            pick(self, cube, "pick up the cube", failed=lambda: any_picked_up(self, other_cubes), pick=True),
             SubTask(
                 "place the cube onto the correct target",
                 done=lambda: dropped_onto(self, cube, target),

@@ -24,7 +24,7 @@ class MMEVLAConfig(PreTrainedConfig):
     composition: the whole configuration as JSON; saving writes it, so that a checkpoint needs no other file for it.
     exec_starts: side file of first execution frames, for datasets that do not mark their conditioning video.
     cache_root: folder of the vision caches that a memory trains on. max_build_frames: larger datasets have theirs built
-        beforehand (`python -m mme_vla.data.cache`). cache_local: every machine has a `cache_root` of its own.
+        beforehand (`mme-vla cache`). cache_local: every machine has a `cache_root` of its own.
     freeze_vision: leave the vision tower as it is; a memory needs that.
     n_action_steps: actions of a chunk that are executed; by default the embodiment's. flow_steps: of the sampler.
     seed: of fresh weights, and of every episode's noise.
@@ -62,7 +62,7 @@ class MMEVLAConfig(PreTrainedConfig):
         """
         features = self.input_features or {}
         for camera in robot.cameras:
-            picture_key(camera, features)
+            image_key(camera, features)
         for what, feature, width in (
             (STATE, features.get(STATE), robot.state.width),
             ("action", self.action_feature, robot.action.width),
@@ -72,7 +72,7 @@ class MMEVLAConfig(PreTrainedConfig):
                 raise UserError(
                     f"The robot {robot.name!r} needs the feature {what!r} of {width} numbers; "
                     + ("there is none. " if shape is None else f"its shape is {list(shape)}. ")
-                    + "Datasets get LeRobot's names with `python -m mme_vla.data.convert … names=lerobot`."
+                    + "Datasets get LeRobot's names with `mme-vla convert … names=lerobot`."
                 )
 
     def get_optimizer_preset(self) -> AdamWConfig:
@@ -101,8 +101,8 @@ class MMEVLAConfig(PreTrainedConfig):
         return None
 
 
-def picture_key(camera: Camera, features: Collection[str]) -> str:
-    """The feature that holds a camera's pictures: under its column's name, or its own.
+def image_key(camera: Camera, features: Collection[str]) -> str:
+    """The feature that holds a camera's images: under its column's name, or its own.
 
     Raises:
         UserError: there is neither.
@@ -112,6 +112,6 @@ def picture_key(camera: Camera, features: Collection[str]) -> str:
         if name in features:
             return str(name)
     raise UserError(
-        f"No pictures of the camera {camera.name!r}: none of {', '.join(names)} is among {listed(sorted(features))}. "
+        f"No images of the camera {camera.name!r}: none of {', '.join(names)} is among {listed(sorted(features))}. "
         'Say which it is with --rename_map=\'{"observation.images.<theirs>": "' + names[0] + "\"}'."
     )

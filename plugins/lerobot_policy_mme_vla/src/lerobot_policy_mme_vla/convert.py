@@ -10,31 +10,30 @@ from lerobot_policy_mme_vla.configuration_mme_vla import STATE, MMEVLAConfig
 from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 from lerobot_policy_mme_vla.processor_mme_vla import make_mme_vla_pre_post_processors
 from mme_vla import Policy
-from mme_vla.config.composition import print_user_errors
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError
-from mme_vla.policy.hub import local_folder
-from mme_vla.policy.saving import read_config
+from mme_vla.policy.saving import local_folder, read_config
 
 
 def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
     """A policy of mme-vla as LeRobot's commands know it."""
-    pictures, numbers = features_of(policy.embodiment)
+    image_features, numbers = features_of(policy.embodiment)
     config = MMEVLAConfig(
-        model=str(policy.config.get("name")), device=device, input_features=pictures, output_features=numbers
+        model=str(policy.config.get("name")), device=device, input_features=image_features, output_features=numbers
     )
     return MMEVLAPolicy(config, model=policy).to(device).eval()
 
 
 def features_of(robot: Embodiment) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
-    """What LeRobot is told that a robot's policy reads and answers; pictures may have any size."""
-    pictures = {
+    """What LeRobot is told that a robot's policy reads and answers; images may have any size."""
+    image_features = {
         f"observation.images.{camera.key or camera.name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE))
         for camera in robot.cameras
     }
     state = PolicyFeature(FeatureType.STATE, (robot.state.width,))
-    return {**pictures, STATE: state}, {"action": PolicyFeature(FeatureType.ACTION, (robot.action.width,))}
+    return {**image_features, STATE: state}, {"action": PolicyFeature(FeatureType.ACTION, (robot.action.width,))}
 
 
 def convert(source: str, target: Path) -> None:
@@ -49,9 +48,9 @@ def convert(source: str, target: Path) -> None:
     if read_config(folder).get("type") == MMEVLAPolicy.name:
         MMEVLAPolicy.from_pretrained(folder).model.save_pretrained(target)
         return
-    theirs = for_lerobot(Policy.from_pretrained(folder))
-    theirs.save_pretrained(target)
-    for pipeline in make_mme_vla_pre_post_processors(theirs.config):
+    lerobot_policy = for_lerobot(Policy.from_pretrained(folder))
+    lerobot_policy.save_pretrained(target)
+    for pipeline in make_mme_vla_pre_post_processors(lerobot_policy.config):
         pipeline.save_pretrained(target)
 
 
@@ -60,9 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m lerobot_policy_mme_vla.convert", description=__doc__)
     parser.add_argument("source", help="checkpoint folder, or owner/name on the hub; of mme-vla, or of this plugin")
     parser.add_argument("target", type=Path, help="new folder")
-    given = parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
     with print_user_errors():
-        convert(given.source, given.target)
+        convert(args.source, args.target)
 
 
 if __name__ == "__main__":

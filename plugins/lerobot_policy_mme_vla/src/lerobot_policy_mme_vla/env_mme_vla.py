@@ -40,10 +40,10 @@ class RoboMMEWithVideo(gym.Env):
         self._env: Any = None
         self._max_episode_steps = max_steps + LONGEST_VIDEO
         self._waiting: list[dict[str, Any]] = []
-        self._shown: dict[str, Any] = {}
-        picture = spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
+        self._frame: dict[str, Any] = {}
+        image = spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
         self.observation_space = spaces.Dict({
-            "pixels": spaces.Dict(dict.fromkeys(VIEWS, picture)),
+            "pixels": spaces.Dict(dict.fromkeys(VIEWS, image)),
             "agent_pos": spaces.Box(-np.inf, np.inf, (STATE,), np.float32),
             "is_demo": spaces.Box(0, 1, (1,), np.float32),
         })  # fmt: skip
@@ -65,25 +65,25 @@ class RoboMMEWithVideo(gym.Env):
             )
         for frame in frames[:-1]:
             frame["is_demo"][:] = 1
-        self._shown, *self._waiting = frames
-        return self._shown, {"task_goal": self.task_description}
+        self._frame, *self._waiting = frames
+        return self._frame, {"task_goal": self.task_description}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Show the next frame of the video, or carry out an action."""
         if self._waiting:
-            self._shown = self._waiting.pop(0)
-            return self._shown, 0.0, False, False, {"is_success": False, "status": "ongoing"}
+            self._frame = self._waiting.pop(0)
+            return self._frame, 0.0, False, False, {"is_success": False, "status": "ongoing"}
         lists, _, terminated, truncated, info = self._env.step(np.asarray(action, np.float32))
         if lists:
-            self._shown = _frames(lists)[-1]
+            self._frame = _frames(lists)[-1]
         status = info["status"]
         over = bool(terminated) or status == "error"
-        return self._shown, 0.0, over, bool(truncated), {"is_success": status == "success", "status": status}
+        return self._frame, 0.0, over, bool(truncated), {"is_success": status == "success", "status": status}
 
     def render(self) -> np.ndarray:
-        """The front picture that is shown."""
-        picture: np.ndarray = self._shown["pixels"]["image"]
-        return picture
+        """The front image that is shown."""
+        image: np.ndarray = self._frame["pixels"]["image"]
+        return image
 
     def close(self) -> None:
         """Free the simulator."""
@@ -105,10 +105,10 @@ def _frames(lists: dict[str, list[Any]]) -> list[dict[str, Any]]:
 
 
 def _features() -> dict[str, PolicyFeature]:
-    pictures = {f"pixels/{name}": PolicyFeature(FeatureType.VISUAL, (SIDE, SIDE, 3)) for name in VIEWS}
+    image_features = {f"pixels/{name}": PolicyFeature(FeatureType.VISUAL, (SIDE, SIDE, 3)) for name in VIEWS}
     return {
         "action": PolicyFeature(FeatureType.ACTION, (ACTION,)),
-        **pictures,
+        **image_features,
         "agent_pos": PolicyFeature(FeatureType.STATE, (STATE,)),
     }
 

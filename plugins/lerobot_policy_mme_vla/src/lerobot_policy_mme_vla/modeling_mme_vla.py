@@ -11,21 +11,27 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_policy_mme_vla.configuration_mme_vla import IS_DEMO, STATE, MMEVLAConfig, picture_key
+from lerobot_policy_mme_vla.configuration_mme_vla import IS_DEMO, STATE, MMEVLAConfig, image_key
 from lerobot_policy_mme_vla.rows import Row, act
 from lerobot_policy_mme_vla.samples import Samples
 from mme_vla import Policy
 from mme_vla.config.composition import compose
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
-from mme_vla.files import write_sums
 from mme_vla.policy.build import build_from_config
+from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.hub import local_folder
-from mme_vla.policy.kinds import policy_class
+from mme_vla.policy.saving import (
+    build_saved,
+    check_processor,
+    local_folder,
+    policy_class,
+    recompute_buffers,
+)
 from mme_vla.policy.tensor_files import WEIGHTS, assign_tensors, load_tensors
 from mme_vla.processing.base import load_processor
 from mme_vla.training.data import check_frozen
+from mme_vla.utils import write_sums
 from mme_vla.weights import start_from
 
 PREFIX = "model."
@@ -99,8 +105,8 @@ class MMEVLAPolicy(PreTrainedPolicy):
             for row, chunk in zip(waiting, act(self.model, waiting, self.config.flow_steps), strict=True):
                 row.plan.extend(chunk[:execute])
         ignored = np.zeros(self.model.embodiment.action.width, np.float32)
-        chosen = [ignored if row.in_video else row.plan.popleft() for row in rows]
-        return torch.from_numpy(np.stack(chosen).astype(np.float32))
+        actions = [ignored if row.in_video else row.plan.popleft() for row in rows]
+        return torch.from_numpy(np.stack(actions).astype(np.float32))
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -124,30 +130,32 @@ class MMEVLAPolicy(PreTrainedPolicy):
         if prev_chunk_left_over is not None:
             if not self.supports_rtc():
                 raise UserError("This policy cannot agree with a chunk under way: use --inference.type=sync.")
-            promised = np.atleast_3d(prev_chunk_left_over.float().cpu().numpy())
-            promised = promised.reshape(-1, *prev_chunk_left_over.shape[-2:])
-            for row, actions in zip(rows, promised, strict=True):
+            action_prefix = np.atleast_3d(prev_chunk_left_over.float().cpu().numpy())
+            action_prefix = action_prefix.reshape(-1, *prev_chunk_left_over.shape[-2:])
+            for row, actions in zip(rows, action_prefix, strict=True):
                 row.read()
                 actions = actions[: len(np.trim_zeros(np.abs(actions).sum(1), "b"))]
                 if len(actions):
-                    row.episode.promise(actions, min(inference_delay or 0, len(actions)))
+                    row.episode.set_action_prefix(actions, min(inference_delay or 0, len(actions)))
         return torch.from_numpy(act(self.model, rows, self.config.flow_steps))
 
     def supports_rtc(self) -> bool:
         """Whether a chunk can be chosen while another is executed: of flows that need not know what was executed."""
-        return self.model.agrees and self.model.require_processor().past_actions == 0
+        return (
+            isinstance(self.model, SupportsRTC)
+            and self.model.supports_rtc
+            and self.model.require_processor().prompt_spec.past_actions == 0
+        )
 
     def _see(self, batch: Mapping[str, Any]) -> list[Row]:
         states = batch[STATE].float().cpu().numpy()
-        pictures = {
-            camera.name: _as_uint8(batch[picture_key(camera, batch)]) for camera in self.model.embodiment.cameras
-        }
+        images = {camera.name: _as_uint8(batch[image_key(camera, batch)]) for camera in self.model.embodiment.cameras}
         demo = np.zeros(len(states), bool)
         if IS_DEMO in batch:
             demo = batch[IS_DEMO].reshape(len(states), -1)[:, 0].cpu().numpy() > 0.5
         goals = batch.get("task") or [""] * len(states)
         if self._rows is None:
-            if self.model.require_processor().reads_subgoal:
+            if self.model.require_processor().prompt_spec.reads_subgoal:
                 raise UserError(
                     "This policy reads a subgoal, and LeRobot's loops have no place for one: evaluate it with "
                     "python -m mme_vla.evaluate."
@@ -155,13 +163,15 @@ class MMEVLAPolicy(PreTrainedPolicy):
             self._rows = [Row(self.model.start_episode(goal, seed=self.config.seed)) for goal in goals]
         for i, row in enumerate(self._rows):
             row.episode.goal = goals[i]
-            row.see({name: views[i] for name, views in pictures.items()}, states[i], bool(demo[i]))
+            row.see({name: views[i] for name, views in images.items()}, states[i], bool(demo[i]))
         return self._rows
 
     # Folders: LeRobot's files, and beside them mme-vla's
 
-    def _save_pretrained(self, save_directory: Path, **given: Any) -> None:  # 0.6.1 hands over a state_dict, later none
-        super()._save_pretrained(save_directory, **given)
+    def _save_pretrained(
+        self, save_directory: Path, **options: Any
+    ) -> None:  # 0.6.1 hands over a state_dict, later none
+        super()._save_pretrained(save_directory, **options)
         write_sums(save_directory, [WEIGHTS, *self.model.require_processor().save(save_directory)])
 
     @classmethod
@@ -188,12 +198,12 @@ class MMEVLAPolicy(PreTrainedPolicy):
             raise UserError(f"{folder} holds no configuration of mme-vla: its config.json lacks 'composition'.")
         sections = json.loads(settings.composition)
         import_trusted(sections, str(folder), False)
-        model = policy_class(sections).from_saved(sections, str(folder))
+        model = build_saved(policy_class(sections), sections, str(folder))
         tensors = {name.removeprefix(PREFIX): tensor for name, tensor in load_tensors(folder).items()}
         assign_tensors(model, tensors, str(folder))
-        model.compute_unsaved()
+        recompute_buffers(model)
         model.processor = load_processor(folder)
-        model.check_processor(str(folder))
+        check_processor(model, str(folder))
         loaded = cls(settings, dataset_stats=dataset_stats, dataset_meta=dataset_meta, model=model)
         return loaded.to(settings.device).eval()
 
@@ -206,7 +216,7 @@ def _built(config: MMEVLAConfig) -> Policy:
     return model
 
 
-def _as_uint8(pictures: Tensor) -> np.ndarray:
-    """LeRobot's pictures [b, 3, H, W] in [0, 1] as they were, [b, H, W, 3] uint8."""
-    whole = pictures if pictures.dtype == torch.uint8 else (pictures.float() * 255).round().to(torch.uint8)
-    return whole.permute(0, 2, 3, 1).cpu().numpy()
+def _as_uint8(images: Tensor) -> np.ndarray:
+    """LeRobot's images [b, 3, H, W] in [0, 1] as they were, [b, H, W, 3] uint8."""
+    converted = images if images.dtype == torch.uint8 else (images.float() * 255).round().to(torch.uint8)
+    return converted.permute(0, 2, 3, 1).cpu().numpy()

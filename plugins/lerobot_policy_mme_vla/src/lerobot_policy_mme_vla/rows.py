@@ -25,9 +25,9 @@ class Row:
     _states: list[np.ndarray] = field(default_factory=list)
     _demo: list[bool] = field(default_factory=list)
 
-    def see(self, pictures: Mapping[str, np.ndarray], state: np.ndarray, is_demo: bool) -> None:
-        """Take a frame: pictures [H, W, 3] uint8 by camera, and the state [s]."""
-        self._frames.append(pictures)
+    def see(self, images: Mapping[str, np.ndarray], state: np.ndarray, is_demo: bool) -> None:
+        """Take a frame: images [H, W, 3] uint8 by camera, and the state [s]."""
+        self._frames.append(images)
         self._states.append(state)
         self._demo.append(is_demo)
         self.in_video = is_demo

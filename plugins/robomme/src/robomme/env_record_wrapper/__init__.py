@@ -5,7 +5,7 @@ from pathlib import Path
 from mme_vla.envs import metadata
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import check_names, make_env
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.errors import UserError
 
 __all__ = ["BenchmarkEnvBuilder"]
@@ -36,7 +36,7 @@ class BenchmarkEnvBuilder:
         max_steps: int = 10000,
     ) -> None:
         if gui_render:
-            raise UserError("gui_render=True: these environments open no window. Leave it out, and look at render().")
+            raise UserError("gui_render=True: these environments open no window. Leave it out, and use render().")
         check_names(env_id, "mme_vla", action_space, None, None)
         self.env_id, self.dataset, self.action_space, self.max_steps = env_id, dataset, action_space, max_steps
         if override_metadata_path is None:

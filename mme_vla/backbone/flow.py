@@ -1,0 +1,157 @@
+"""Flow matching: the path from noise to actions, its loss, and the Euler sampler.
+
+τ = 1 is pure noise: x_τ = τ·noise + (1 − τ)·actions, target u = noise − actions.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.registry import HEADS
+from mme_vla.types import Noise, Overlap
+
+EULER_STEPS = 10  # as released
+MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
+
+
+def sample_time(
+    count: int, distribution: str, device: torch.device, generator: torch.Generator | None = None
+) -> Tensor:
+    """Sample τ [count]: `beta` gives 0.001 + 0.999·Beta(1.5, 1), as released; `uniform` U(0, 1), as in the paper."""
+    uniform = torch.rand(count, device=device, generator=generator)
+    if distribution == "uniform":
+        return uniform
+    return 0.001 + 0.999 * uniform ** (1 / 1.5)  # the quantile function of Beta(α, 1) is u^(1/α)
+
+
+def interpolate(actions: Tensor, noise: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+    """Return (x_τ, u) for chunks [b, h, a] and times [b]."""
+    tau = time[:, None, None]
+    return tau * noise + (1 - tau) * actions, noise - actions
+
+
+def step_loss(velocity: Tensor, target: Tensor) -> Tensor:
+    """Squared error averaged over action dimensions: [b, h, a] → [b, h]. Padded dimensions count, as released."""
+    return (velocity.float() - target.float()).square().mean(-1)
+
+
+def time_embedding(time: Tensor, width: int) -> Tensor:
+    """Sin-cos features [b, width] of τ [b], periods 4e-3 … 4 in geometric steps."""
+    fraction = torch.linspace(0, 1, width // 2, device=time.device, dtype=torch.float32)
+    period = MIN_PERIOD * (MAX_PERIOD / MIN_PERIOD) ** fraction
+    # Angles reach 1,600 rad, where the order of float32 operations shows: this is the released one.
+    angle = time.float()[:, None] * (2 * math.pi / period)
+    return torch.cat([angle.sin(), angle.cos()], dim=-1)
+
+
+def euler_times(steps: int, device: torch.device) -> Tensor:
+    """The times 1, 1 − 1/steps, … of Euler steps [steps], added up in float32 as released."""
+    # Computed on the device: a copy from the CPU would wait for the GPU, and could not be in a CUDA graph.
+    times, time = [], torch.ones((), device=device)
+    for _ in range(steps):
+        times.append(time)
+        time = time - 1.0 / steps
+    return torch.stack(times)
+
+
+def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) -> Tensor:
+    """Integrate from noise to actions: x ← x − v/steps, with `velocity(x, index)` at `euler_times`."""
+    x = noise
+    for index in range(steps):
+        x = x - velocity(x, index).to(x.dtype) / steps
+    return x
+
+
+Predict = Callable[[Tensor, Tensor], Tensor]
+"""`predict(x_t, time)`: the network's output [b, h, a] at noisy chunks [b, h, a] and flow times [b]."""
+PredictAt = Callable[[Tensor, int], Tensor]
+"""`predict(x, index)`: the same while sampling, at the flow time with this index in `FlowHead.times`."""
+
+
+@HEADS.register("flow")
+class FlowHead:
+    """Flow matching as π0.5 has it: time distribution, loss and Euler sampler of a network that predicts the velocity.
+
+    A head of your own overrides what differs, registers under a name and is chosen with `backbone.head.name`.
+
+    Args:
+        horizon, action_dim: of a chunk [h, a].
+        time_distribution: `beta` or `uniform`, see `sample_time`.
+        steps: Euler steps unless the caller says otherwise.
+    """
+
+    def __init__(self, horizon: int, action_dim: int, time_distribution: str = "beta", steps: int = EULER_STEPS):
+        if steps < 1:
+            raise UserError(f"backbone.head.steps={steps} must be at least 1.")
+        self.horizon, self.action_dim = horizon, action_dim
+        self.time_distribution, self.steps = time_distribution, steps
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """`noise` [n, h, a] and flow times `time` [n], on the CPU."""
+        noise = torch.randn(count, self.horizon, self.action_dim, generator=generator)
+        return {"noise": noise, "time": sample_time(count, self.time_distribution, noise.device, generator)}
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """The starting `noise` [h, a], on the CPU."""
+        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+
+    def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
+        """The loss [b, h] of chunks [b, h, a]: squared error of the velocity."""
+        x_t, target = interpolate(actions.float(), noise["noise"], noise["time"])
+        return step_loss(predict(x_t, noise["time"]), target)
+
+    def times(self, steps: int, device: torch.device) -> Tensor:
+        """The flow times [steps] at which `sample` calls the network."""
+        return euler_times(steps, device)
+
+    def velocity(self, predict: PredictAt, steps: int, device: torch.device) -> PredictAt:
+        """The velocity [b, h, a] at each of so many Euler steps from the network's output."""
+        return predict
+
+    def sample(self, predict: PredictAt, noise: Tensor, steps: int, overlap: Overlap | None = None) -> Tensor:
+        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed."""
+        velocity = self.velocity(predict, steps, noise.device)
+        if overlap is not None:
+            from mme_vla.speed.rtc import rtc_guidance
+
+            velocity = rtc_guidance(velocity, overlap, self.times(steps, noise.device))
+        return euler(noise, steps, velocity)
+
+
+@HEADS.register("clean_flow")
+class CleanFlowHead(FlowHead):
+    """Flow matching of a network that predicts the chunk without its noise; the velocity follows."""
+
+    def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
+        """Squared error [b, h] of the chunk without its noise."""
+        x_t, _ = interpolate(actions.float(), noise["noise"], noise["time"])
+        return step_loss(predict(x_t, noise["time"]), actions)
+
+    def velocity(self, predict: PredictAt, steps: int, device: torch.device) -> PredictAt:
+        """(x − clean chunk) / τ; τ is at least one step."""
+        times = self.times(steps, device)
+
+        def velocity(x: Tensor, index: int) -> Tensor:
+            return (x - predict(x, index)) / times[index].clamp(min=1 / steps)
+
+        return velocity
+
+
+class HasFlowHead:
+    """Capability of a backbone: its chunks are learned and sampled by a `FlowHead`, so they support real-time chunking.
+
+    A subclass calls `make_head` in its constructor.
+    """
+
+    head: FlowHead
+
+    def make_head(self, config: Any) -> None:
+        """Build the head that `config.head` names, for the sizes and the time distribution of `config`."""
+        self.head = HEADS.build(
+            config.head, horizon=config.horizon, action_dim=config.action_dim,
+            **({} if "time_distribution" in config.head else {"time_distribution": config.time_distribution}),
+        )  # fmt: skip

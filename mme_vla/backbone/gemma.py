@@ -1,0 +1,347 @@
+"""Gemma experts under joint attention: every expert has its own weights, all share one attention.
+
+b batch · n tokens · d an expert's width · N query heads · K key heads · h head width
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.attention import (
+    AttentionMask,
+    Block,
+    MaskLayout,
+    Span,
+    Visibility,
+    apply_custom_positions,
+    attend,
+    build_mask,
+    select_rows,
+    token_positions,
+)
+from mme_vla.backbone.base import Hook, bind_hook
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.layers import AdaRMSNorm, Modulation, RMSNorm, Rotation, compute_dtype, rotate, rotation
+from mme_vla.speed.recompute import Recompute, run_layer
+
+KeyValue = tuple[Tensor, Tensor]
+
+
+class StaticKV(NamedTuple):
+    """Keys and values of one layer [b, past + n, K, h]: those of the past, and room for a pass of n tokens."""
+
+    k: Tensor
+    v: Tensor
+
+    def filled(self, k: Tensor, v: Tensor) -> KeyValue:
+        """All keys and values, this pass's [b, n, K, h] written where the room is."""
+        for buffer, new in ((self.k, k), (self.v, v)):
+            buffer[:, -new.shape[1] :].copy_(new)
+        return self.k, self.v
+
+    def past(self, n: int) -> KeyValue:
+        """What is there without the last n."""
+        return self.k[:, :-n], self.v[:, :-n]
+
+
+class LayerModulation(NamedTuple):
+    """One layer's two time modulations, made beforehand for a sampling step."""
+
+    attention: Modulation
+    mlp: Modulation
+
+
+class Segment(NamedTuple):
+    """Neighbouring blocks of one expert, run as one matrix."""
+
+    expert: str
+    tokens: Tensor
+
+
+class GatedMLP(nn.Module):
+    """GeGLU: (gelu(x W₀) ⊙ x W₁) W₂, with W₀ and W₁ in one matrix."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.gate_up = nn.Linear(width, 2 * hidden, bias=False)
+        self.down = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        gate, up = self.gate_up(x).chunk(2, dim=-1)
+        if torch.is_grad_enabled():
+            return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
+        return self.down(torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up))  # in place: a chunk's largest tensors
+
+
+class ExpertLayer(nn.Module):
+    """One expert's weights in one layer.
+
+    In the last layer only the answering expert is read further: of the others that layer needs keys and values
+    alone (`keys_only`), and has no other weights.
+    """
+
+    def __init__(self, config: BackboneConfig, expert: ExpertConfig, condition_width: int | None, keys_only: bool):
+        super().__init__()
+        self.heads, self.kv_heads, self.head_dim = config.num_heads, config.num_kv_heads, config.head_dim
+        self.keys_only = keys_only
+
+        def norm() -> nn.Module:
+            return AdaRMSNorm(expert.width, condition_width) if condition_width else RMSNorm(expert.width)
+
+        self.attention_norm = norm()
+        kv_width = 2 * self.kv_heads * self.head_dim
+        if keys_only:
+            self.kv = nn.Linear(expert.width, kv_width, bias=False)
+            return
+        q_width = self.heads * self.head_dim
+        self.qkv = nn.Linear(expert.width, q_width + kv_width, bias=False)
+        self.out = nn.Linear(q_width, expert.width, bias=False)
+        self.mlp_norm = norm()
+        self.mlp = GatedMLP(expert.width, expert.mlp_dim)
+
+    def project(
+        self, x: Tensor, rope: Rotation, condition: Tensor | Modulation | None
+    ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
+        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate.
+
+        Queries and keys come back rotated, by `rope` at their positions.
+        """
+        x, gate = self.attention_norm(x, condition)
+        heads = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
+        v = heads[..., -self.kv_heads :, :]
+        qk = rotate(heads[..., : -self.kv_heads, :], rope)  # in one go: queries first, keys last
+        k = qk[..., -self.kv_heads :, :]
+        return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
+
+    def finish(
+        self,
+        x: Tensor,
+        attended: Tensor,
+        gate: Tensor | None,
+        condition: Tensor | Modulation | None,
+        hook: Callable[[Tensor], Tensor] | None,
+    ) -> Tensor:
+        """Add the attention's output, then the MLP's; the hook changes only what the MLP reads."""
+        x = _residual(x, self.out(attended), gate)
+        normed, gate = self.mlp_norm(x if hook is None else hook(x), condition)
+        return _residual(x, self.mlp(normed), gate)
+
+
+def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
+    return x + update if gate is None else torch.addcmul(x, update, gate)
+
+
+class JointBlock(nn.Module):
+    """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap it whole."""
+
+    def __init__(
+        self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str, last: bool
+    ) -> None:
+        super().__init__()
+        self.action_expert = action_expert
+        self.experts = nn.ModuleDict({
+            name: ExpertLayer(
+                config, expert, expert.width if name == action_expert else None, last and name != action_expert
+            )
+            for name, expert in experts.items()
+        })  # fmt: skip
+
+    def forward(
+        self,
+        segments: Sequence[Segment],
+        rope: Rotation,
+        mask: AttentionMask,
+        condition: Tensor | LayerModulation | None,
+        hook: Callable[[Tensor], Tensor] | None = None,
+        past: KeyValue | StaticKV | None = None,
+    ) -> tuple[list[Segment], KeyValue]:
+        """Run one layer.
+
+        Args:
+            segments: this pass's tokens in sequence order. rope: their rotation.
+            mask: additive [b, 1, n, past + n], or what another backend of attention reads.
+            condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
+            hook: see `Hook`, layer already bound.
+            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with room for this pass's own.
+
+        Returns:
+            The updated segments (of those that asked), and this pass's keys (rotated) and values.
+        """
+        of_attention, of_mlp = condition if isinstance(condition, LayerModulation) else (condition, condition)
+        querying, queries, keys, values, row = [], [], [], [], 0
+        for segment in segments:
+            layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
+            adaptive = segment.expert == self.action_expert
+            rows = slice(row, row + segment.tokens.shape[1])
+            q, k, v, gate = layer.project(segment.tokens, rope.rows(rows), of_attention if adaptive else None)
+            keys.append(k)
+            values.append(v)
+            if q is not None:
+                querying.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
+                queries.append(q)
+            row = rows.stop
+        k, v = _join(keys), _join(values)
+        if not querying:
+            return [], (k, v)
+        all_k, all_v = _after(past, k, v)
+        query_mask = (
+            mask if len(querying) == len(segments) else select_rows(mask, [rows for *_, rows in querying], k.dtype)
+        )
+        attended = attend(_join(queries), all_k, all_v, query_mask)
+        pieces = attended.split([rows.stop - rows.start for *_, rows in querying], dim=1)
+        updated = [
+            Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
+            for (segment, layer, gate, of, change, _), piece in zip(querying, pieces, strict=True)
+        ]
+        return updated, (k, v)
+
+
+@dataclass
+class KVCache:
+    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens are valid."""
+
+    layers: Sequence[KeyValue | StaticKV]
+    spans: list[Span]
+    mask: Tensor  # [b, past] bool
+
+    def preallocate(self, tokens: int) -> "KVCache":
+        """The same with room behind it, in which every one of many passes of so many tokens writes its own.
+
+        It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites the last.
+        """
+        static = [
+            StaticKV(*(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1])))
+            for layer in self.layers
+        ]
+        return KVCache(static, self.spans, self.mask)
+
+
+class Layout(NamedTuple):
+    """What attention needs to know of a pass beside its tokens; the same for every Euler step of a chunk."""
+
+    spans: list[Span]  # of this pass and the cached ones before it
+    valid: Tensor  # [b, past + n] bool
+    mask: AttentionMask  # additive [b, 1, n, past + n], or what another backend of attention reads
+    rope: Rotation
+    mask_layout: MaskLayout
+    dtype: torch.dtype  # of the tokens in all layers
+
+
+@dataclass
+class Conditioning:
+    """Time modulations of all layers, made once for the fixed times of a sampler (`JointTransformer.conditioning`)."""
+
+    layers: list[LayerModulation]
+    final: Modulation
+
+    def at(self, index: int, rows: int = 1) -> "Conditioning":
+        """Return the modulations of one time, which has `rows`: one for the whole batch, or one a sample."""
+
+        def pick(m: Modulation) -> Modulation:
+            return Modulation(*(x[index * rows : (index + 1) * rows] for x in m))
+
+        return Conditioning([LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final))
+
+
+class JointTransformer(nn.Module):
+    """All layers and the final norm of the one expert that answers; nothing that no action reads."""
+
+    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str = "action") -> None:
+        super().__init__()
+        self.head_dim, self.action_expert, self.experts = config.head_dim, action_expert, experts
+        self.gradient_checkpointing: Recompute = False
+        self.attention = "auto"
+        self.layers = nn.ModuleList(
+            JointBlock(config, experts, action_expert, last=i == config.depth - 1) for i in range(config.depth)
+        )
+        width = experts[action_expert].width
+        self.final_norm = AdaRMSNorm(width, width)
+
+    def conditioning(self, condition: Tensor) -> Conditioning:
+        """Compute every layer's modulation for conditions [m, c] at once: the weights are read once, not m times."""
+        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
+        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
+        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
+
+    def modulating(self) -> list[AdaRMSNorm]:
+        """The norms that a condition modulates: two of every layer, and the final one."""
+        experts: list[Any] = [block.experts[self.action_expert] for block in self.layers]  # type: ignore[index]
+        return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [self.final_norm]
+
+    @property
+    def _compiled(self) -> bool:
+        return self.layers[0]._compiled_call_impl is not None
+
+    def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
+        """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
+        spans = [Span(block.name, len(block)) for block in blocks]
+        asking = torch.cat([block.mask for block in blocks], 1)
+        positions = apply_custom_positions(token_positions(asking, past.mask if past else None), blocks)
+        all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
+        mask_layout, dtype = MaskLayout.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
+        mask = build_mask(mask_layout, dtype, self.attention, self._compiled)
+        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim), mask_layout, dtype)
+
+    def forward(
+        self,
+        blocks: Sequence[Block],
+        layout: Layout,
+        condition: Tensor | Conditioning | None = None,
+        hook: Hook | None = None,
+        past: KVCache | None = None,
+        keep: bool = False,
+    ) -> tuple[Tensor | None, KVCache | None]:
+        """Run blocks, after those of `past`.
+
+        Args:
+            blocks: in sequence order. layout: of these blocks after this past.
+            condition: time condition [b, c] of the answering expert, or its modulations; unread without that expert.
+            hook: the per-layer hook. past: an earlier pass's cache.
+            keep: whether to return a cache of `past` and this pass.
+
+        Returns:
+            The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
+        """
+        segments = _segments(blocks, layout.dtype, self._compiled)
+        cached: list[KeyValue] = []
+        for i, block in enumerate(self.layers):
+            of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
+            args = (segments, layout.rope, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
+            segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
+            if keep:
+                # Copies where they are views: a view would keep all queries of its layer alive.
+                k, v = _after(past.layers[i] if past else None, *kv)
+                cached.append((k.contiguous(), v.contiguous()))
+        output = None
+        if segments:
+            final = condition.final if isinstance(condition, Conditioning) else condition
+            output, _ = self.final_norm(segments[-1].tokens, final)
+        return output, KVCache(cached, layout.spans, layout.valid) if keep else None
+
+
+def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:
+    """Keys and values of a pass behind those of the past."""
+    if past is None:
+        return k, v
+    if isinstance(past, StaticKV):
+        return past.filled(k, v)
+    return torch.cat([past[0], k], 1), torch.cat([past[1], v], 1)
+
+
+def _join(parts: list[Tensor]) -> Tensor:
+    """Concatenate along the sequence, without a copy where there is one part."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def _segments(blocks: Sequence[Block], dtype: torch.dtype, compiled: bool) -> list[Segment]:
+    """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or are not."""
+    runs: list[tuple[str, list[Tensor]]] = []
+    for block in blocks:
+        if not runs or runs[-1][0] != block.expert:
+            runs.append((block.expert, []))
+        # Not a view of something else, as no later layer's tokens are: the first layer then shares their compiled code.
+        runs[-1][1].append(block.tokens.to(dtype, copy=compiled and block.tokens._is_view()))
+    return [Segment(expert, _join(tokens)) for expert, tokens in runs]

@@ -1,0 +1,337 @@
+"""nano: a backbone of under five million parameters, whose action tokens read images, words and memory.
+
+The prefix is not processed in layers: each layer of the action column attends to the context as it is. That makes a
+training step on stored tokens cheap enough for a laptop.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.attention import Block, additive_mask, attend
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hook, Injection, bind_hook
+from mme_vla.backbone.config import ExpertConfig, check_positive
+from mme_vla.backbone.flow import HasFlowHead, time_embedding
+from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm
+from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
+from mme_vla.backbone.pi05 import initialise
+from mme_vla.errors import UserError
+from mme_vla.registry import BACKBONES
+from mme_vla.speed import Recomputes
+from mme_vla.speed.recompute import Recompute
+from mme_vla.types import Batch, Noise, map_noise
+
+
+@dataclass(frozen=True)
+class TowerConfig:
+    """The convolutional vision tower: channels of its stages over 32×32, 16×16 and 8×8 places of a 128-pixel image.
+
+    `blocks_…` are residual blocks. `pretrained` takes the weights that ship with the library.
+    """
+
+    image_size: int = 128
+    width_32: int = 48
+    width_16: int = 96
+    width_8: int = 160
+    blocks_32: int = 1
+    blocks_16: int = 1
+    blocks_8: int = 2
+    pretrained: bool = True
+
+    def __post_init__(self) -> None:
+        check_positive(self, "vision.")
+        if self.image_size % 16:
+            raise UserError(f"vision.image_size={self.image_size} must be a multiple of 16.")
+        for width in (self.width_32, self.width_16, self.width_8):
+            if width % 8:
+                raise UserError(f"vision: {width} channels cannot be normalised in 8 groups; take a multiple of 8.")
+
+
+@dataclass(frozen=True)
+class NanoConfig:
+    """A vision tower, a column of context tokens (`vlm`) and a column of action tokens that reads them (`action`)."""
+
+    vision: TowerConfig = field(default_factory=TowerConfig)
+    vlm: ExpertConfig = field(default_factory=lambda: ExpertConfig(128, 256))
+    action: ExpertConfig = field(default_factory=lambda: ExpertConfig(128, 256))
+    depth: int = 2
+    num_heads: int = 4
+    head_dim: int = 32
+    state_dim: int = 8
+    vocab_size: int = 2048
+    action_dim: int = 8
+    horizon: int = 4
+    draws: int = 4
+    time_distribution: str = "beta"
+    head: Mapping[str, Any] = field(default_factory=lambda: {"name": "clean_flow"}, hash=False)
+
+    def __post_init__(self) -> None:
+        check_positive(self, "backbone.")
+        if self.action.width % 2 or self.head_dim % 2:
+            raise UserError("backbone.action.width and backbone.head_dim must be even.")
+        if self.time_distribution not in ("beta", "uniform"):
+            raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
+
+
+MAX_VIEWS, MAX_WORDS = 4, 256
+FIRST = CLASSES.index("red cube") - 1
+"""Index, among the classes of a token, of the class that the goal names."""
+STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
+"""Per radian or metre: a finger's four centimetres count as well as a joint's turn."""
+
+
+class Reader(nn.Module):
+    """One layer of the action column: attention among a chunk's actions, attention to the context, and an MLP."""
+
+    def __init__(self, config: NanoConfig) -> None:
+        super().__init__()
+        width, inner = config.action.width, config.num_heads * config.head_dim
+        self.head_dim = config.head_dim
+        self.norm = AdaRMSNorm(width, width)
+        self.qkv = nn.Linear(width, 3 * inner, bias=False)
+        self.out = nn.Linear(inner, width, bias=False)
+        self.read_norm = AdaRMSNorm(width, width)
+        self.read_q = nn.Linear(width, inner, bias=False)
+        self.read_gate = nn.Linear(width, inner)
+        self.read_out = nn.Linear(inner, width, bias=False)
+        self.mlp_norm = AdaRMSNorm(width, width)
+        self.up = nn.Linear(width, 2 * config.action.mlp_dim)
+        self.down = nn.Linear(config.action.mlp_dim, width)
+
+    def forward(
+        self,
+        x: Tensor,
+        condition: Tensor,
+        k: Tensor,
+        v: Tensor,
+        mask: Tensor,
+        versions: int,
+        hook: Callable[[Tensor], Tensor] | None,
+    ) -> Tensor:
+        """The action tokens [b·r, h, d] after this layer.
+
+        Args:
+            condition: [b·r, d]. k, v: of the context, [b, n, N, h]; mask: additive [b, 1, 1, n]. versions: r.
+            hook: changes the MLP's input.
+        """
+        normed, gate = self.norm(x, condition)
+        q, new_k, new_v = self.qkv(normed).unflatten(-1, (-1, self.head_dim)).chunk(3, dim=-2)
+        x = x + (1 + gate) * self.out(attend(q, new_k, new_v, None))
+        normed, gate = self.read_norm(x, condition)
+        q = self.read_q(normed).unflatten(-1, (-1, self.head_dim))
+        # The versions of a sample read the same context: they are side by side as its queries.
+        together = q.unflatten(0, (-1, versions)).flatten(1, 2)
+        read = attend(together, k, v, mask).unflatten(1, (versions, -1)).flatten(0, 1)
+        # The goal gates what is read: products are learned sooner here than behind the MLP.
+        x = x + (1 + gate) * self.read_out(read * self.read_gate(condition)[:, None])
+        if hook is not None:
+            rows = x.unflatten(0, (-1, versions)).unbind(1)
+            x = torch.stack([hook(row) for row in rows], 1).flatten(0, 1)
+        normed, gate = self.mlp_norm(x, condition)
+        inner, opening = self.up(normed).chunk(2, dim=-1)
+        return x + (1 + gate) * self.down(nn.functional.gelu(inner) * opening)
+
+
+class Column(nn.Module):
+    """What a block of context becomes for the action column: keys and values of every layer, in one product."""
+
+    def __init__(self, width: int, config: NanoConfig) -> None:
+        super().__init__()
+        self.shape = (config.depth, 2, config.num_heads, config.head_dim)
+        self.norm = RMSNorm(width)
+        self.kv = nn.Linear(width, math.prod(self.shape), bias=False)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """[b, n, d] → [layers, 2, b, n, N, h]."""
+        return self.kv(self.norm(tokens)[0]).unflatten(-1, self.shape).movedim((2, 3), (0, 1))
+
+
+class Context(NamedTuple):
+    """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d]."""
+
+    keys_values: Tensor
+    mask: Tensor
+    condition: Tensor
+    hook: Hook | None
+
+
+@BACKBONES.register("nano")
+class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recomputes):
+    """A pretrained convolutional tower, and layers of action tokens that read the context; chunks by flow matching.
+
+    The network predicts the chunk without its noise, and the velocity follows. The loss takes several noisy versions of
+    each sample, which share the context.
+    """
+
+    vision: ConvTower
+    Config = NanoConfig
+    supports = frozenset({"blocks", "expert", "hook"})
+    lora_targets = ("qkv", "read_q", "out", "read_out", "up", "down")
+    heads = ("action_in", "action_out", "state_in", "prompt_in")
+    lora_exclude = r"\.\w*norm\.dense$"
+    PARTS: ClassVar[Mapping[str, str]] = {
+        "vision": r"vision\.",
+        "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\.",
+        "memory": r"columns\.",
+        "action": "",
+    }
+
+    def __init__(self, config: NanoConfig, extra_experts: Mapping[str, ExpertConfig] | None = None) -> None:
+        super().__init__(config, extra_experts)
+        self.config = config
+        tower, width, action_width = config.vision, config.vlm.width, config.action.width
+        self.image_size, self.grid = tower.image_size, tower.image_size // 16
+        self.horizon, self.action_dim = config.horizon, config.action_dim
+        # The tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
+        self.vision = ConvTower(
+            (tower.width_32, tower.width_16, tower.width_8), (tower.blocks_32, tower.blocks_16, tower.blocks_8), width
+        )
+        self.vision_width = self.vision.token_width
+        initialise(self.vision)
+        if tower.pretrained and self.vision.out.weight.device.type != "meta":
+            load_shipped(self.vision)
+        self.places = nn.Embedding(self.grid**2, width)
+        self.views = nn.Embedding(MAX_VIEWS, width)
+        self.see_in = nn.Linear(self.vision_width, width)
+        self.see = nn.Sequential(nn.Linear(width, config.vlm.mlp_dim), nn.GELU(), nn.Linear(config.vlm.mlp_dim, width))
+        self.embedding = nn.Embedding(config.vocab_size, width)
+        self.positions = nn.Embedding(MAX_WORDS, width)
+        self.prompt_in = nn.Sequential(nn.Linear(width, action_width), nn.GELU(), nn.Linear(action_width, action_width))
+        self.state_in = nn.Linear(2 * len(STATE_FREQUENCIES) * config.state_dim, action_width)
+        self.time_in = nn.Sequential(
+            nn.Linear(action_width, action_width), nn.SiLU(), nn.Linear(action_width, action_width)
+        )
+        self.action_in = nn.Linear(config.action_dim, action_width)
+        self.steps = nn.Embedding(config.horizon, action_width)
+        contexts = {**(extra_experts or {}), "vlm": config.vlm}
+        self.columns = nn.ModuleDict({name: Column(expert.width, config) for name, expert in contexts.items()})
+        self.layers = nn.ModuleList(Reader(config) for _ in range(config.depth))
+        self.final = RMSNorm(action_width)
+        self.action_out = nn.Linear(action_width, config.action_dim)
+        for name, module in self.named_children():
+            if name != "vision":
+                initialise(module)
+        self.make_head(config)
+
+    def init_experts(self, names: Sequence[str]) -> None:
+        """Give the columns of these experts fresh weights."""
+        for name in names:
+            initialise(self.columns[name])
+
+    def compile(self, **options: object) -> None:
+        """Compile the tower and every layer in place."""
+        for module in (self.vision, *self.layers):
+            module.compile(**options)
+
+    def encode_images(self, images: Tensor) -> Tensor:
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 64, d]; no graph is kept while the tower is frozen."""
+        frozen = not any(p.requires_grad for p in self.vision.parameters())
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
+            tokens: Tensor = self.vision(images)
+            return tokens
+
+    def condition_on_prompt(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
+        """Swap the class that the prompt names first with the first cube, so that one index holds the requested class.
+
+        `ConvTower.words`, part of the tower's weights, says which word names which class.
+        """
+        named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
+        places = torch.where(named.any(1), named.int().argmax(1), prompt.shape[1])
+        first = torch.where(named.any(2).any(1), places.argmin(1), FIRST)  # b
+        order = torch.arange(named.shape[2], device=prompt.device).repeat(len(prompt), 1)
+        order = torch.where(order == first[:, None], FIRST, order)
+        order[:, FIRST] = first
+        groups = torch.cat([order + group * order.shape[1] for group in range(4)], 1)
+        remaining = torch.arange(groups.shape[1], tokens.shape[-1], device=prompt.device).expand(len(prompt), -1)
+        permutation = torch.cat([groups, remaining], 1)
+        return tokens.gather(-1, permutation.view(len(prompt), *[1] * (tokens.ndim - 2), -1).expand_as(tokens))
+
+    def embed(self, batch: Batch) -> list[Block]:
+        """Blocks `images`, of all views (`batch.view_tokens` where they were encoded before), and `prompt`."""
+        views = batch.images.shape[1]
+        if batch.view_tokens is None:
+            tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, (-1, views))
+        else:
+            tokens = batch.view_tokens.to(self.places.weight.dtype)
+        tokens = self.condition_on_prompt(tokens, batch.prompt, batch.prompt_mask)
+        located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
+        encoded = located + self.see(located)
+        image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
+        words = self.embedding(batch.prompt) + self.positions.weight[: batch.prompt.shape[1]]
+        return [
+            Block("images", encoded.flatten(1, 2), image_mask, "vlm"),
+            Block("prompt", words, batch.prompt_mask, "vlm"),
+        ]
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """`noise` [n, r, h, a] and flow times `time` [n, r], for r noisy versions a sample."""
+        versions = self.config.draws
+        noise = self.head.training_noise(count * versions, generator)
+        return map_noise(noise, lambda value: value.unflatten(0, (count, versions)))
+
+    def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
+        """Squared error [b, h] of the chunk without its noise, the mean over its noisy versions."""
+        assert batch.actions is not None
+        versions = noise["noise"].shape[1]
+        context = self.read_context(batch, injection)
+        actions = batch.actions.repeat_interleave(versions, 0)
+        flat = map_noise(noise, lambda value: value.flatten(0, 1))
+        losses = self.head.loss(lambda x_t, time: self.denoise(context, x_t, time, versions), actions, flat)
+        return losses.unflatten(0, (-1, versions)).mean(1)
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """The starting `noise` [h, a]."""
+        return self.head.sampling_noise(generator)
+
+    @torch.no_grad()
+    def sample(
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """A normalised chunk [b, h, a] in so many Euler steps, 10 by default."""
+        steps = steps or self.head.steps
+        context, start = self.read_context(batch, injection), noise["noise"]
+        times = self.head.times(steps, start.device)
+
+        def clean(x: Tensor, index: int) -> Tensor:
+            return self.denoise(context, x, times[index].expand(len(x)), 1)
+
+        return self.head.sample(clean, start, steps, batch.overlap)
+
+    def read_context(self, batch: Batch, injection: Injection) -> Context:
+        """All that does not depend on the noise."""
+        visible = [block for block in injection.blocks if block.name in injection.visibility["action"]]
+        keys_values = torch.cat([self.columns[block.expert](block.tokens) for block in visible], 3)
+        mask = additive_mask(torch.cat([block.mask for block in visible], 1)[:, None], keys_values.dtype)
+        (prompt,) = (block for block in injection.blocks if block.name == "prompt")
+        words = self.prompt_in(prompt.tokens) * batch.prompt_mask[..., None]
+        condition = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
+        if batch.state is not None:
+            condition = condition + self.state_in(_waves(batch.state.float()))
+        return Context(keys_values, mask, condition, injection.hook)
+
+    def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
+        """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]."""
+        condition = self.time_in(time_embedding(time, self.config.action.width))
+        condition = condition + context.condition.repeat_interleave(versions, 0)
+        x = self.action_in(x_t) + self.steps.weight + condition[:, None]
+        for i, layer in enumerate(self.layers):
+            x = layer(x, condition, *context.keys_values[i], context.mask, versions, bind_hook(context.hook, i))
+        output: Tensor = self.action_out(self.final(x)[0]).float()
+        return output
+
+    def recompute(self, mode: Recompute) -> None:
+        """No effect: a layer's activations are a chunk's few tokens."""
+
+    def parts(self) -> Mapping[str, str]:
+        """Tower; words and images; columns of an integration's extra experts; the rest is `action`."""
+        return self.PARTS
+
+
+def _waves(state: Tensor) -> Tensor:
+    """Sin and cos of a state [b, s] at several frequencies, [b, 8·s]."""
+    angles = state[..., None] * torch.tensor(STATE_FREQUENCIES, device=state.device)
+    return torch.cat([angles.sin(), angles.cos()], -1).flatten(1)

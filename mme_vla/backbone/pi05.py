@@ -1,0 +1,276 @@
+"""π0.5: embed images and prompt, the flow-matching loss, and the sampler, in this order."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mme_vla.backbone.attention import Block, check_backend
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.flow import HasFlowHead, time_embedding
+from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
+from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, float32_linear
+from mme_vla.backbone.siglip import VisionTower
+from mme_vla.registry import BACKBONES
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recomputes, Sharded
+from mme_vla.speed.recompute import Recompute
+from mme_vla.types import Batch, Noise, PastViews
+
+if TYPE_CHECKING:
+    from mme_vla.speed.sharding import ShardGroup
+
+
+@BACKBONES.register("pi05")
+class Pi05Backbone(
+    Backbone,
+    HasFlowHead,
+    HasExtraExperts,
+    HasLoraTargets,
+    HasAttentionBackends,
+    Recomputes,
+    Sharded,
+    CapturableSampling,
+):
+    """Vision tower, VLM expert and action expert under joint attention; chunks by flow matching.
+
+    Extra experts are more columns of the same joint attention.
+    """
+
+    Config = BackboneConfig
+    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
+    heads = ("action_in", "action_out", "time_in", "time_out")
+    # The VLM's last layer has `kv` in place of `qkv`.
+    lora_targets = tuple(
+        f"experts.{expert}.{layer}"
+        for expert in ("vlm", "action")
+        for layer in ("qkv", *(("kv",) if expert == "vlm" else ()), "out", "mlp.gate_up", "mlp.down")
+    )
+    # These are computed in float32 from their weight, without calling an adapter that wraps them.
+    lora_exclude = rf"\.({'|'.join(heads)}|\w*norm\.dense)$"
+    PARTS: ClassVar[Mapping[str, str]] = {
+        "vision": r"vision\.",
+        "vlm": r"embedding\.|.*\.experts\.vlm\.",
+        "memory": r".*\.experts\.(?!action\.)",
+        "action": "",
+    }
+
+    def __init__(self, config: BackboneConfig, extra_experts: Mapping[str, ExpertConfig] | None = None) -> None:
+        super().__init__(config, extra_experts)
+        self.config = config
+        self.vision_width, width = config.vlm.width, config.action.width
+        self.image_size, self.grid = config.vision.image_size, config.vision.image_size // config.vision.patch_size
+        self.horizon, self.action_dim = config.horizon, config.action_dim
+        # The vision tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
+        self.vision = VisionTower(config.vision, config.vlm.width)
+        initialise(self.vision)
+        self.embedding = nn.Embedding(config.vocab_size, config.vlm.width)
+        experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
+        self.transformer = JointTransformer(config, experts)
+        self.keep_times = False
+        self._cached: dict[int, Conditioning] = {}
+        self._cached_stamp: tuple[object, ...] = ()
+        self.action_in = nn.Linear(config.action_dim, width)
+        self.action_out = nn.Linear(width, config.action_dim)
+        self.time_in = nn.Linear(width, width)
+        self.time_out = nn.Linear(width, width)
+        for module in (self.embedding, self.transformer, self.action_in, self.action_out, self.time_in, self.time_out):
+            initialise(module)
+        self.make_head(config)
+
+    def encode_images(self, images: Tensor) -> Tensor:
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is frozen."""
+        return self._through_tower(images)
+
+    def _through_tower(self, images: Tensor, *clips: Any) -> Tensor:
+        frozen = not any(p.requires_grad for p in self.vision.parameters())
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
+            return self.vision(images, *clips)
+
+    def view_tokens(self, images: Tensor, past: PastViews | None) -> Tensor:
+        """Tokens [b, v, n, d] of current views [b, v, 3, s, s], which attend to past ones if there are any."""
+        if past is None:
+            return self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        clips = torch.cat([past.images, images[:, None]], 1).transpose(1, 2)  # b v t 3 s s
+        frame_mask = functional.pad(past.mask, (0, 1), value=True)[:, None].expand(clips.shape[:3])
+        return self._through_tower(clips.flatten(0, 1), frame_mask.flatten(0, 1), past.every).unflatten(
+            0, clips.shape[:2]
+        )
+
+    def embed(self, batch: Batch) -> list[Block]:
+        """Blocks `images`, of the current views, and `prompt`."""
+        tokens = self.view_tokens(batch.images, batch.past)
+        image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
+        # Token embeddings are scaled by √d, image tokens are not.
+        words = self.embedding(batch.prompt) * self.config.vlm.width**0.5
+        return [
+            Block("images", tokens.flatten(1, 2), image_mask, "vlm"),
+            Block("prompt", words, batch.prompt_mask, "vlm"),
+        ]
+
+    def action_block(self, x_t: Tensor) -> Block:
+        """The noisy chunk [b, h, a] as the block of the action expert."""
+        mask = torch.ones(x_t.shape[:2], dtype=torch.bool, device=x_t.device)
+        return Block("action", float32_linear(self.action_in, x_t), mask, "action")
+
+    def time_condition(self, time: Tensor) -> Tensor:
+        """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
+        x = time_embedding(time, self.config.action.width)
+        for layer in (self.time_in, self.time_out):
+            x = nn.functional.silu(float32_linear(layer, x))
+        return x
+
+    def read_velocity(self, hidden: Tensor) -> Tensor:
+        """The velocity [b, h, a] in float32 from the output [b, n, d], whose last h tokens are the actions."""
+        return float32_linear(self.action_out, hidden[:, -self.horizon :])
+
+    # Training
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """`noise` [n, h, a] and flow times `time` [n]."""
+        return self.head.training_noise(count, generator)
+
+    def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
+        """The flow-matching loss [b, h]."""
+        assert batch.actions is not None
+        return self.head.loss(partial(self.velocity, injection), batch.actions, noise)
+
+    def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
+        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
+        blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
+        layout = self.transformer.layout(blocks, injection.visibility)
+        condition = self.time_condition(time)
+        condition = condition if injection.condition is None else injection.condition(condition)
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
+        return self.read_velocity(hidden)
+
+    # Sampling
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """The starting `noise` [h, a]."""
+        return self.head.sampling_noise(generator)
+
+    @torch.no_grad()
+    def sample(
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """Integrate the flow from noise to a chunk, in `steps` Euler steps (10 by default).
+
+        All that does not depend on the flow time is computed once: memory, keys and values of the prefix and of the
+        modulator, and every layer's time modulation. A step runs the action block alone.
+        """
+        x, steps = noise["noise"], self.head.steps if steps is None else steps
+        prefix = self.prefill(injection)
+        blocks = [*injection.beside, self.action_block(x)]
+        layout = self.transformer.layout(blocks, injection.visibility, prefix)
+        past = prefix.preallocate(sum(map(len, blocks)))
+        if injection.condition is None:
+            conditions, rows = self.conditions(steps), 1
+        else:  # memory changes the condition of each sample: every time for each
+            rows, condition = len(x), self.time_condition(self.head.times(steps, x.device))
+            changed = torch.cat([injection.condition(one.expand(rows, -1)) for one in condition])
+            conditions = self.transformer.conditioning(changed)
+
+        def velocity(x_t: Tensor, i: int) -> Tensor:
+            return self.denoise(x_t, conditions.at(i, rows), layout, past, injection)
+
+        return self.head.sample(velocity, x, steps, batch.overlap)
+
+    def prefill(self, injection: Injection) -> KVCache:
+        """Keys and values of the prefix, which all steps of a chunk share."""
+        layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, layout, keep=True)
+        return prefix
+
+    def denoise(
+        self, x_t: Tensor, condition: Tensor | Conditioning, layout: Layout, prefix: KVCache, injection: Injection
+    ) -> Tensor:
+        """The velocity at one flow time, from the cached prefix: the cost of one Euler step."""
+        blocks = [*injection.beside, self.action_block(x_t)]
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past=prefix)
+        return self.read_velocity(hidden)
+
+    def conditions(self, steps: int) -> Conditioning:
+        """Every layer's time modulations at the times of so many steps; kept for the next chunk while `keep_times`."""
+        if not self.keep_times:
+            return self._conditions(steps)
+        stamp = self.sampling_stamp()
+        if stamp != self._cached_stamp:
+            self._cached, self._cached_stamp = {}, stamp
+        if steps not in self._cached:
+            self._cached[steps] = self._conditions(steps)
+        return self._cached[steps]
+
+    def _conditions(self, steps: int) -> Conditioning:
+        device = next(self.parameters()).device
+        return self.transformer.conditioning(self.time_condition(self.head.times(steps, device)))
+
+    # Optional capabilities
+
+    def parts(self) -> Mapping[str, str]:
+        """Tower and projector; embedding and VLM expert; extra experts of an integration; the rest is `action`."""
+        return self.PARTS
+
+    def init_experts(self, names: Sequence[str]) -> None:
+        """Initialise these experts in every layer."""
+        for block in self.transformer.layers:
+            for name in names:
+                initialise(block.experts[name])  # type: ignore[index, arg-type]
+
+    def compile(self, **options: Any) -> None:
+        """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still.
+
+        Lengths are symbols, so that prompts and batches of any length share their code. `fullgraph` reports what would
+        fall back to eager. `options` are `torch.compile`'s and override these.
+        """
+        # Layers share one code: each passes it in training, prefill and denoising, with and without gradients.
+        torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
+        for module in (self.vision, *self.transformer.layers):
+            module.compile(**{"fullgraph": True, "dynamic": True, **options})
+
+    def set_attention_backend(self, name: str) -> None:
+        self.transformer.attention = check_backend(name)
+
+    def recompute(self, mode: Recompute) -> None:
+        """Recompute layers in the backward pass (activation checkpointing)."""
+        self.transformer.gradient_checkpointing = mode
+
+    def shard_groups(self) -> "Sequence[ShardGroup]":
+        """Tower, token embedding, and every layer of all experts."""
+        from mme_vla.speed.sharding import ShardGroup, backbone_groups
+
+        return [*backbone_groups(self), ShardGroup(self.embedding, full=True)]
+
+    def compile_sampling(self) -> None:
+        """Keep the time modulations between chunks."""
+        self.keep_times = True
+
+    def sampling_stamp(self) -> tuple[object, ...]:
+        """Place and version of the weights that time modulations are computed from, and the precision."""
+        layers = self.transformer.modulating()
+        weights = [p for module in (self.time_in, self.time_out, *layers) for p in module.parameters()]
+        return torch.is_autocast_enabled(weights[0].device.type), *((p.data_ptr(), p._version) for p in weights)
+
+
+def initialise(module: nn.Module) -> None:
+    """Fresh weights: LeCun normal matrices, zero biases, unit-variance embeddings; adaptive norms keep their zeros."""
+    adaptive = {id(m.dense) for m in module.modules() if isinstance(m, AdaRMSNorm)}
+    for m in module.modules():
+        if isinstance(m, RMSNorm):
+            nn.init.zeros_(m.scale)
+        elif id(m) in adaptive:
+            for parameter in m.parameters():
+                nn.init.zeros_(parameter)
+        elif isinstance(m, nn.Linear | nn.Conv2d):
+            fan_in = m.weight[0].numel()
+            nn.init.normal_(m.weight, std=fan_in**-0.5)
+            if m.bias is not None:
+                nn.init.zeros_(m.bias)
+        elif isinstance(m, nn.Embedding):
+            nn.init.normal_(m.weight, std=m.embedding_dim**-0.5)
+    if isinstance(module, VisionTower):
+        assert module.vit.pos_embed is not None
+        nn.init.normal_(module.vit.pos_embed, std=0.02)

@@ -1,0 +1,48 @@
+"""The commands: the only place that reads a command line. `mme-vla NAME` and `python -m mme_vla NAME` run them."""
+
+import os
+import sys
+from importlib import import_module
+
+from mme_vla.cli.errors import print_user_errors
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "train": ("train", "train a policy"),
+    "evaluate": ("evaluate", "run a policy on the benchmark"),
+    "results": ("results", "tables, comparisons and a report from finished runs"),
+    "analyse": ("analyse", "what a memory attends to, selects, modulates and costs"),
+    "probe": ("probe", "what a policy takes from its memory, on recorded episodes and in closed loop"),
+    "inspect": ("inspect", "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it"),
+    "serve": ("serve", "put a policy behind a port"),
+    "harness": ("harness", "put a policy behind AI2's vla-evaluation-harness"),
+    "play": ("play", "play the tasks yourself, or let a model play"),
+    "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
+    "exec-starts": ("exec_starts", "where the conditioning videos of a dataset end, if it has no such column"),
+    "cache": ("cache", "the vision tokens of a dataset, computed once"),
+    "nano": ("nano", "from nothing to a page of results on one task, on two cores"),
+    "vision-pretrain": ("vision_pretrain", "the vision tower of the nano backbone, from renders of the tasks"),
+    "record": ("record", "demonstrate episodes of the benchmark and keep them as a dataset"),
+    "gallery": ("gallery", "the tasks at a glance, one demonstrated episode each, on one page"),
+    "weights": ("weights", "a checkpoint from one format to another"),
+    "subgoal-build": ("subgoal_build", "training data of the subgoal predictors"),
+    "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
+    "sample": ("sample", "the dataset that the package ships, from a full one"),
+    "train-tokenizer": ("train_tokenizer", "the small tokenizer of the package"),
+}
+"""Name on the command line → module of this package, and a line of help."""
+
+
+_WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}
+"""Options that only print."""
+
+
+def run(module: str) -> None:
+    """Run the command in a module of this package, importing it first: Ctrl-C ends the import with a message, too.
+
+    A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
+    """
+    with print_user_errors():
+        first = os.environ.get("LOCAL_RANK", "0") == "0"
+        if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
+            print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
+        import_module(f"{__name__}.{module}").main()

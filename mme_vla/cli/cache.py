@@ -1,0 +1,69 @@
+"""`mme-vla cache model=… data=…`: build vision caches; `torchrun` shares the episodes out."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig
+
+from mme_vla.cli.command import cli
+from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError
+from mme_vla.utils import FolderLock
+
+if TYPE_CHECKING:
+    import torch
+
+
+@cli("cache")
+def main(cfg: DictConfig) -> None:
+    """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line describe."""
+    from mme_vla.data.cache import cache_folder, default_cache_root, fingerprint
+    from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
+    from mme_vla.data.sources import open_sources
+    from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.capabilities import with_vision_memory
+    from mme_vla.training.runs import start_from, weights_to_start_from
+
+    if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise UserError("rebuild=true removes files that other processes write: run it once without torchrun first.")
+    init_from = weights_to_start_from(cfg.init_from)
+    policy = build_from_config(cfg, fresh_backbone=init_from is None)
+    if init_from is not None:
+        print(start_from(policy, init_from))
+    device = _device(cfg.device)
+    memory = policy.to(device).memory
+    if memory is None:
+        raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
+    encoder = with_vision_memory(policy)
+    tower, dtype = encoder.vision_fingerprint(), str(encoder.history_dtype).removeprefix("torch.")
+    root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
+    for source in open_sources(cfg.data.sources, policy.embodiment):
+        expected = fingerprint(source, memory.storage, tower, dtype)
+        folder = cache_folder(root, source, expected)
+        if cfg.dry_run:
+            plan = estimate(source, memory, encoder.encode_frames, dtype, cfg.data.cache.batch_size)
+            print(
+                f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode, "
+                f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
+            )
+            continue
+        rank, world = process_rank()
+        if rank == 0:
+            source.verify()  # its images are all about to be read, and for the last time
+        # Beside the folder, and one for each share: processes that take other shares, or train, are welcome.
+        with FolderLock(folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"):
+            if cfg.rebuild:
+                clear_cache(folder)
+            batch_size = cfg.data.cache.batch_size
+            n_encoded = build_cache(source, memory, encoder.encode_frames, folder, expected, batch_size=batch_size)
+        print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")
+
+
+def _device(name: str) -> "torch.device":
+    """`auto` and `cuda` mean this process's own GPU under torchrun."""
+    import torch
+
+    device = find_device(name)
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    return torch.device("cuda", local_rank) if device.type == "cuda" and device.index is None else device

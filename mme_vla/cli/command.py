@@ -1,0 +1,178 @@
+"""The decorator that turns a function into a command with a Hydra configuration."""
+
+import functools
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from itertools import zip_longest
+from pathlib import Path
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.types import Override, ValueType
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import help_page, unknown_option
+from mme_vla.config import plugins
+from mme_vla.config.composition import (
+    VERSION_BASE,
+    compose,
+    config_dir,
+    import_plugins,
+    local_hydra,
+    name_under_hydra,
+    parse,
+)
+from mme_vla.config.naming import join_memories, several_memories
+from mme_vla.config.override_errors import paths
+from mme_vla.errors import UserError, printable
+
+
+def cli[T](
+    config_name: str, directory: Path | None = None
+) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
+    """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
+
+    The overrides are checked before the command starts. `print_user_errors` surrounds it: exceptions that are bugs keep
+    their traceback. Called with a config, the decorated function runs `main` directly.
+    """
+
+    def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
+        @functools.wraps(main)
+        def job(cfg: DictConfig) -> T:
+            with print_user_errors():  # here too: Hydra would print a traceback before it gets further
+                _require_values(cfg)
+                join_memories(cfg)
+                if {"name", "memory"} <= set(cfg):
+                    cfg.name = name_under_hydra(_root_=cfg)
+                import_plugins(cfg)
+                return main(cfg)
+
+        @functools.wraps(main)
+        def command(cfg: DictConfig | None = None) -> T | None:
+            if cfg is not None:
+                import_plugins(cfg)
+                return main(cfg)
+            tree = directory or config_dir()
+            sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
+            with print_user_errors():
+                _check_command_line(config_name, tree)
+                start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
+                # Hydra makes the run folder: what the disk says to that is to come here, not to be printed there.
+                os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+                try:
+                    start(job)()
+                except HydraException as error:
+                    raise UserError(str(error)) from error
+            return None
+
+        return command
+
+    return decorate
+
+
+def options_first(words: Sequence[str]) -> list[str]:
+    """Move the options of a command line before its overrides: Hydra's parser takes no other order.
+
+    A command line with an unknown option stays as it is.
+    """
+    args, unknown = get_args_parser().parse_known_intermixed_args(words)
+    if unknown:
+        return list(words)
+    options = list(words)
+    options.reverse()
+    for override in reversed(args.overrides):
+        options.remove(override)  # its last occurrence: the value of an option may be the same word
+    return [*reversed(options), *args.overrides]
+
+
+def _check_command_line(config_name: str, tree: Path) -> None:
+    args, unknown = get_args_parser().parse_known_intermixed_args()
+    if unknown:
+        raise unknown_option(unknown[0], sys.argv[1:], known_keys(config_name, tree))
+    if args.help:
+        extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
+        print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
+        raise SystemExit(0)
+    if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
+        return  # nothing of this tree is composed
+    extra = [Path(args.config_dir).resolve()] if args.config_dir else []
+    check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
+
+
+def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
+    """The text of `--help` beside these words (`mme_vla.cli.help`).
+
+    Args:
+        trees: folders of YAML files, the library's first.
+    """
+
+    def selected_groups(overrides: Sequence[str]) -> dict[str, str]:
+        compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
+        with local_hydra(trees[0], trees[1:]):
+            cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
+            taken = cfg.hydra.runtime.choices.items()
+            words = {group: "null" if name is None else str(name) for group, name in taken}
+            return {group: name for group, name in words.items() if not group.startswith("hydra/")}
+
+    return help_page(config_name, words, trees, selected_groups)
+
+
+def known_keys(config_name: str, tree: Path) -> list[str]:
+    """Every dotted key of a command's configuration as it is by default."""
+    with local_hydra(tree, []):
+        return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
+
+
+def check_overrides(
+    config_name: str,
+    overrides: Sequence[str],
+    *,
+    directory: Path | None = None,
+    extra_dirs: Sequence[Path] = (),
+) -> None:
+    """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included."""
+    columns = [_choices(override) for override in parse(overrides)]
+    for row in zip_longest(*columns) if columns else [()]:
+        # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
+        combination = [
+            column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column
+        ]
+        compose(config_name, combination, directory=directory, extra_dirs=extra_dirs)
+
+
+def _choices(override: Override) -> list[str]:
+    """The overrides that a sweep means; the override itself when it is none."""
+    if not override.is_sweep_override():
+        return [str(override.input_line)]
+    if not override.is_discrete_sweep() or override.value_type == ValueType.GLOB_CHOICE_SWEEP:
+        return []  # an interval has no list of values, a glob names only what exists
+    left = str(override.input_line).partition("=")[0]
+    return [f"{left}={value}" for value in override.sweep_string_iterator()]
+
+
+def _require_values(cfg: DictConfig) -> None:
+    missing = sorted(OmegaConf.missing_keys(cfg))
+    if missing:
+        raise UserError(f"A value is needed for {', '.join(missing)}: add {' '.join(f'{key}=…' for key in missing)}")
+
+
+def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
+    """Write a command's log and warnings to standard error; `clock` puts the time of day before each line."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
+    logger.setLevel(logging.INFO)
+    logger.handlers = [handler]
+    logger.propagate = False
+    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
+
+
+class _Printable(logging.Formatter):
+    """Lines as a terminal may have them: they name what untrusted files and clients sent."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))

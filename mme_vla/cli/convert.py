@@ -1,0 +1,24 @@
+"""`mme-vla convert input=<files or folders> output=<new folder>`: HDF5 demonstrations to one dataset."""
+
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from mme_vla.cli.command import cli
+from mme_vla.config.sections import read_section
+from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.hdf5 import find_files, list_episodes
+
+
+@cli("convert")
+def main(cfg: DictConfig) -> None:
+    """Convert as configs/convert.yaml and the command line say."""
+    inputs = [cfg.input] if isinstance(cfg.input, str) else list(cfg.input)
+    episodes = list_episodes(find_files(inputs))
+    if cfg.episodes is not None:
+        episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
+    output = Path(cfg.output)
+    options = {"images": cfg.images, "fps": cfg.fps, "keyframes": cfg.keyframes, "names": cfg.names}
+    n_converted = convert(episodes, output, read_section(ConvertOptions, cfg.video, "video", **options))
+    already = len(episodes) - n_converted
+    print(f"{output}: {len(episodes)} episodes ({n_converted} written now, {already} already there).")

@@ -1,0 +1,101 @@
+"""How a command ends: exit codes and one-line messages of user errors, signals and full disks."""
+
+import os
+import select
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn, TextIO
+
+from mme_vla.errors import UserError, printable
+from mme_vla.utils.io import disk_trouble
+
+DISK_TROUBLE, MISTAKE = 1, 2  # exit codes; a signal's is 128 and its number, as a shell has it
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which a scheduler sends before it kills; handled like Ctrl-C."""
+
+
+@contextmanager
+def print_user_errors() -> Iterator[None]:
+    """Surround a command: what is not a bug ends the process with a message instead of a traceback.
+
+    A `UserError` ends with code 2, a disk that refuses (full, read-only, too many files) with 1, Ctrl-C with 130 and
+    SIGTERM with 143. Where the reader of standard output closes it, as `| head` does, the command ends quietly. Other
+    exceptions pass.
+    """
+    with _terminable():
+        try:
+            yield
+        except BrokenPipeError:
+            if not _has_no_reader(sys.stdout):
+                raise
+        except KeyboardInterrupt as stop:
+            _end_interrupted(stop)
+        except Exception as error:
+            if (hidden := _interrupted(error)) is not None:
+                _end_interrupted(hidden)
+            message = str(error) if isinstance(error, UserError) else disk_trouble(error)
+            if message is None:
+                raise
+            _print(f"Error: {message}", "Error: ")
+            raise SystemExit(MISTAKE if isinstance(error, UserError) else DISK_TROUBLE) from None
+        finally:
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:  # what is still to be written has no reader
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupted(error: BaseException | None) -> KeyboardInterrupt | None:
+    """The signal that an exception hides: a `finally` that fails on half-made objects replaces it."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__context__
+    return error
+
+
+def _end_interrupted(stop: KeyboardInterrupt) -> NoReturn:
+    number = signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT
+    name = "SIGTERM" if number == signal.SIGTERM else "Ctrl-C"
+    _print(f"Stopped by {name}. What was finished is kept: the same command continues from there.", "Stopped")
+    raise SystemExit(128 + number) from None
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether a stream is a pipe whose other end is closed."""
+    poll = select.poll()
+    poll.register(stream, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Turn SIGTERM into an exception while this is open, where the process would just have died of it."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _print(text: str, bold: str) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    remaining = printable(text.removeprefix(bold))
+    try:
+        Console(stderr=True, soft_wrap=True).print(Text(bold, "bold red"), Text(remaining), sep="")
+    except OSError:  # the terminal, or the disk that standard error goes to, is what gave way
+        sys.stderr = None

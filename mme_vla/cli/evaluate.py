@@ -1,0 +1,199 @@
+"""`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark (configs/evaluate.yaml)."""
+
+import logging
+import multiprocessing
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
+from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.policy.saving import composition_digest
+
+if TYPE_CHECKING:
+    import torch
+
+    from mme_vla.evaluation.rollout.evaluation import Evaluation
+    from mme_vla.policy.base import Policy
+    from mme_vla.subgoal import SubgoalPredictor, Usage
+
+# Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+logger = logging.getLogger("mme_vla.evaluate")
+SUBGOAL_MODES = ("inline", "background")
+
+
+@cli("evaluate")
+def main(cfg: DictConfig) -> None:
+    """Run the episodes that have no result yet."""
+    from mme_vla.data.sources import open_sources
+    from mme_vla.envs.episodes import named_tasks
+    from mme_vla.envs.make import require_simulator
+    from mme_vla.evaluation.feed import with_sessions
+    from mme_vla.evaluation.recordings import all_recordings
+    from mme_vla.evaluation.results.report import policy_facts
+    from mme_vla.evaluation.rollout.evaluation import (
+        RunFacts,
+        checkpoint_label,
+        choose_episodes,
+        choose_shard,
+        default_output,
+        evaluate,
+        memory_budget,
+    )
+    from mme_vla.evaluation.rollout.settings import RolloutSettings
+
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    values = {str(key): value for key, value in config.items()}
+    settings = RolloutSettings.from_config(values)
+    if values["deterministic"]:
+        settings = replace(settings, max_batch=1)
+        repeat_exactly()
+    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split)
+    shard = choose_shard(values["shard"])
+    if settings.env == "mme_vla":
+        require_simulator()
+    log_to_terminal(logger)
+    device = choose_device(str(cfg.device))
+    policy, name, source = load_policy(cfg, "evaluate", logger, device)
+    prepare_sampling(policy, cfg.sampling, logger)
+    sessions = values["recordings"]
+    recordings = [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
+    subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
+    facts = RunFacts(
+        name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
+        None if subgoals is None else str(values["subgoal"]["name"]), memory_budget(policy),
+        composition_digest(policy.config),
+    )  # fmt: skip
+    if not settings.render:
+        logger.warning("render=false: the policy sees black images; only the time of the simulation means anything")
+    output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
+    count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
+    logger.info("%s into %s%s", count, output, f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "")
+    notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
+    notes["deterministic"] = values["deterministic"]
+    notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
+    _use_spawn()
+    try:
+        done = evaluate(
+            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings,
+            subgoals=subgoals, shard=shard, source=source, notes=notes,
+            times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
+        )  # fmt: skip
+    finally:
+        if subgoals is not None:
+            report_usage(subgoals.usage)
+            subgoals.close()
+    report(done, output)
+
+
+def repeat_exactly() -> None:
+    """Have PyTorch choose kernels whose results repeat; where an operation has none, it warns."""
+    import torch
+
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.backends.cudnn.benchmark = False
+
+
+def choose_device(name: str) -> "torch.device":
+    """The configured device; under torchrun `auto` gives every process of a machine a GPU of its own."""
+    import torch
+
+    device = find_device(name)
+    if name == "auto" and device.type == "cuda" and "LOCAL_RANK" in os.environ:
+        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
+    return device
+
+
+def choose_subgoals(
+    policy: "Policy",
+    section: dict[str, Any] | None,
+    mode: str = "inline",
+    device: "torch.device | None" = None,
+) -> "SubgoalPredictor | None":
+    """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
+
+    Args:
+        section: the section `subgoal` of the configuration. mode: `inline`, or `background`.
+        device: the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the predictor.
+    """
+    from mme_vla.evaluation.rollout.evaluation import check_subgoals
+    from mme_vla.processing.prompt import subgoal_kind
+    from mme_vla.subgoal import BackgroundPredictor, build_predictor
+
+    if mode not in SUBGOAL_MODES:
+        raise UserError(f"subgoal_mode={mode!r}. {did_you_mean(mode, SUBGOAL_MODES)}")
+    if section is None:
+        if policy.require_processor().prompt_spec.reads_subgoal:
+            logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
+        return None
+    kind = subgoal_kind(policy)
+    if kind is not None and not words_of("subgoal.kind"):
+        section = {**section, "kind": kind.removesuffix("_subgoal")}
+    if device is not None and section.get("device") == "auto":
+        section = {**section, "device": str(device)}
+    predictor = build_predictor(section)
+    check_subgoals(policy, predictor)
+    return BackgroundPredictor(predictor) if predictor is not None and mode == "background" else predictor
+
+
+def report(done: "Evaluation", output: Path) -> None:
+    """Say how it went, task by task, and where the table comes from."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mme_vla.evaluation.records import count_outcomes
+    from mme_vla.evaluation.rollout.subgoals import total_score
+
+    tasks = list(dict.fromkeys(record.task for record in done.records))
+    scored = total_score(done.records) is not None
+    judged = ("right subgoals", "points off by") if scored else ()
+    table = Table("task", *("episodes", "success", "fail", "timeout", "error", "success rate"), *judged)
+    rows = [(task, [r for r in done.records if r.task == task]) for task in tasks]
+    for task, records in [*rows, *([("all", done.records)] if len(rows) > 1 else [])]:
+        counts = count_outcomes(records)
+        outcomes = [str(counts[name]) for name in ("success", "fail", "timeout", "error")]
+        score = total_score(records)
+        cells = (score.show() if score else ("", "")) if scored else ()
+        table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %", *cells)
+    # Piped into a file there is no terminal to fit: as wide as the table is.
+    console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
+    if rows:
+        console.print(table)
+    work = done.workload
+    if work.batches:
+        logger.info(
+            "%d chunks in batches of %.1f on average; the policy was busy for %.0f of %.0f s",
+            work.chunks, work.mean_batch, work.policy_s, work.wall_s,
+        )  # fmt: skip
+    if any(record.outcome == "error" for record in done.records):
+        logger.warning("some episodes ended in an error: the same command tries them again")
+    logger.info("python -m mme_vla.results %s", output)
+
+
+def report_usage(usage: "Usage") -> None:
+    """Say in one line what a predictor did, as far as it did anything."""
+    counts = {
+        "calls": usage.calls, "answers from the cache": usage.cached, "retries": usage.retries,
+        "tokens read": usage.input_tokens, "tokens written": usage.output_tokens,
+        **{f"{problem} answers": count for problem, count in usage.problems.items()},
+    }  # fmt: skip
+    words = [f"{count:,} {what}" for what, count in counts.items() if count]
+    words += [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
+    if words:
+        logger.info("subgoals: %s", ", ".join(words))
+
+
+def _use_spawn() -> None:
+    """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
+    if multiprocessing.get_start_method() == "loky":
+        multiprocessing.set_start_method("spawn", force=True)

@@ -1,0 +1,119 @@
+"""`mme-vla gallery`: the 16 tasks at a glance, one demonstrated episode each, on one page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.envs import metadata
+from mme_vla.envs.episodes import choose_episodes, named_tasks
+from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.errors import UserError
+from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
+from mme_vla.utils.pages import render
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+    from PIL.Image import Image
+
+    from mme_vla.envs.task import Task
+
+COLUMNS = 4  # images a row
+EVERY = 8
+"""Steps between two images that are taken; which of them are shown is decided at the end."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The front view at one step."""
+
+    step: int
+    image: np.ndarray
+    subtask: str
+    video: bool
+
+
+def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
+    """Demonstrate a task, with an image every few steps; also returns whether it succeeded."""
+    from mme_vla.envs.observations import Include, Observer
+    from mme_vla.envs.recording.recorder import demonstrate
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.subtasks import NO_RECORD
+
+    observer = Observer(task, Include(), render=True)
+    snapshots: list[Snapshot] = []
+
+    def capture(evaluated: dict[str, Any]) -> None:
+        observer.follow()
+        subtask = task.progress.displayed
+        if task.steps_done % every == 1 and subtask.text != NO_RECORD:
+            image = observer.frame(evaluated)["front_rgb"]
+            snapshots.append(Snapshot(task.steps_done, image, subtask.text, subtask.video))
+
+    task.reset()
+    observer.start()
+    task.on_frame = capture
+    try:
+        success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
+    finally:
+        task.on_frame = None
+    return snapshots, success
+
+
+def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
+    """Some of the snapshots side by side, spread evenly, each with its step; video frames have a red border."""
+    selected = [snapshots[i] for i in evenly_spaced(len(snapshots), tiles)]
+    labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in selected]
+    images = [
+        Tile(shot.image, label, RED if shot.video else None) for shot, label in zip(selected, labels, strict=True)
+    ]
+    return contact_sheet(images, COLUMNS)
+
+
+def run(cfg: "DictConfig") -> None:
+    """Draw the gallery as configs/show.yaml and the command line say."""
+    from mme_vla.data.console import progress
+
+    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
+    if not isinstance(cfg.tiles, int) or cfg.tiles < 2:
+        raise UserError(f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
+    require_simulator()
+    folder = Path(cfg.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    with progress("show", len(specs), unit="tasks") as advance:
+        for spec in specs:
+            env, snapshots = _demonstrated(spec)
+            several = sum(other.task == spec.task for other in specs) > 1
+            image_name = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
+            strip(snapshots, cfg.tiles).save(folder / image_name, quality=82)
+            entries.append((spec.task, env.goals()[0], image_name))
+            env.close()
+            advance(1)
+    (folder / "README.md").write_text(render("gallery.md", entries=entries))
+    print(f"{folder / 'README.md'}: {len(entries)} tasks.")
+
+
+def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
+    """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
+    from mme_vla.envs.scene.placement import SceneError
+
+    for seed in range(spec.seed, spec.seed + 100):
+        try:
+            env = make_task(spec.task, render=True, seed=seed, difficulty=spec.difficulty)
+        except SceneError:
+            continue
+        snapshots, success = demonstrate_with_images(env)
+        if success:
+            return env, snapshots
+        env.close()
+    raise UserError(f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}.")
+
+
+def main() -> None:
+    """Run `mme-vla gallery`."""
+    from mme_vla.cli.command import cli
+
+    cli("show")(run)()

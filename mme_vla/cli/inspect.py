@@ -1,0 +1,237 @@
+"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, and what a memory remembers of it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli
+from mme_vla.errors import UserError, printable
+from mme_vla.memory.base import make_scorer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from mme_vla.data.episodes import EpisodeSource
+    from mme_vla.memory.base import Memory
+    from mme_vla.policy.base import Policy
+
+
+@cli("inspect")
+def main(cfg: DictConfig) -> None:
+    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its memory."""
+    from rich.console import Console
+
+    console = Console(markup=False)
+    if (cfg.checkpoint is None) == (cfg.dataset is None):
+        raise UserError("Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built in).")
+    if cfg.checkpoint is not None:
+        return show_checkpoint(Path(cfg.checkpoint), console, bool(cfg.trust_plugins))
+    from mme_vla.data.episodes import EpisodeSource
+    from mme_vla.embodiment import Embodiment
+
+    robot = Embodiment.from_dict(OmegaConf.to_container(cfg.embodiment, resolve=True))  # type: ignore[arg-type]
+    source = EpisodeSource(cfg.dataset, cfg.exec_starts, robot=robot)
+    if cfg.episode is None:
+        return show_dataset(source, console)
+    episode, step = check_place(source, cfg.episode, cfg.step)
+    show_episode(source, episode, step, console)
+    if cfg.memory is None:
+        return None
+    image = draw_memory(source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console)
+    console.print(f"image: {image}", highlight=False, soft_wrap=True)
+    return None
+
+
+def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = False) -> None:
+    """Print a checkpoint's parts, training state and normalisation statistics.
+
+    With `trust_plugins` the modules that the checkpoint names are imported.
+    """
+    from mme_vla.embodiment.action_space import numbered
+    from mme_vla.policy.base import Policy
+    from mme_vla.policy.run_folders import STATE, resolve_checkpoint
+    from mme_vla.training.checkpoint import read_state
+
+    folder = resolve_checkpoint(folder)
+    policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
+    table = _table(str(folder), "part", "tensors", "parameters", "dtype")
+    for part, tensors in _parts(policy).items():
+        dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
+        table.add_row(part, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
+    total = list(policy.parameters())
+    table.add_row("all", str(len(total)), f"{sum(t.numel() for t in total):,}", "", style="bold")
+    _show(table, console)
+    settings = _table("configuration", "section", "values")
+    for name, section in policy.config.items():
+        settings.add_row(name, _summary(section))
+    settings.add_row("words", printable(policy.require_processor().prompt_spec.encoder))
+    if (folder / STATE).is_file():
+        state = read_state(folder)
+        settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
+        settings.add_row("recipe", _summary(state["config"].get("train", {})))
+        settings.add_row("data", _summary(state["config"].get("data", {})))
+        settings.add_row("versions", _summary(state["versions"]))
+    _show(settings, console)
+    stats = policy.require_processor().stats
+    if stats is not None:
+        space = policy.embodiment.action
+        action = "action delta" if space.relative or space.of_pose else "action"
+        for title, of, names in (
+            ("state", stats.state, numbered(len(stats.state))),
+            (action, stats.actions, space.names),
+        ):
+            # Extremes are kept where a policy normalises by them.
+            bounds = [bound for bound in ("min", "q01", "q99", "max") if getattr(of, bound) is not None]
+            numbers = _table(f"normalisation of the {title}", "number", *bounds)
+            for i, name in enumerate(names):
+                numbers.add_row(name, *(f"{getattr(of, bound)[i]:.3f}" for bound in bounds))
+            _show(numbers, console)
+
+
+def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) -> None:
+    """Print a dataset's episodes, at most `most` of them, and its totals."""
+    from mme_vla.data.lerobot_files import SAMPLE
+
+    compared = source.verify()
+    table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
+    for episode in range(min(len(source), most)):
+        frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
+        goal, seconds = printable(source.goal(episode)), f"{frames / source.fps:.1f}"
+        table.add_row(str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal)
+    if len(source) > most:
+        table.add_row("…", f"{len(source) - most} more")
+    frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
+    table.add_row("all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold")
+    _show(table, console)
+    subgoals = printable(", ".join(source.subgoal_names)) or "none"
+    console.print(
+        f"{frames - video} execution steps to train on · {source.fps:g} frames per second · images as "
+        f"{'video' if source.video_cameras else 'images'} · subgoals: {subgoals}",
+        highlight=False,
+    )
+    for what, names in (("state", source.state_names), ("action", source.robot.action.names)):
+        if names:
+            console.print(f"{what}: {len(names)} numbers: {printable(', '.join(names))}", highlight=False)
+    if compared:
+        checksums = f"all {compared} files are as they were written"
+    elif source.root == SAMPLE:
+        checksums = "none, this dataset ships with the library"
+    else:
+        checksums = "none, so damage to images or numbers cannot be noticed"
+    console.print(f"checksums: {checksums}", highlight=False)
+
+
+def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Console") -> None:
+    """Print an episode's phases, and what is recorded at one step."""
+    start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
+    table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
+    table.add_row("task", printable(source.task(episode)))
+    table.add_row("goal", printable(source.goal(episode)))
+    table.add_row("video", f"frames 0 … {start - 1}" if start else "none")
+    table.add_row("execution", f"frames {start} … {length - 1}")
+    for name, text in source.subgoals(episode, step).items():
+        table.add_row(name, printable(text))
+    table.add_row("state", _numbers(source.states(episode, step, step + 1)[0], source.state_names))
+    table.add_row("action", _numbers(source.actions(episode, step, step + 1)[0], source.robot.action.names))
+    _show(table, console)
+
+
+def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
+    """The episode and step asked for; the last step by default."""
+    if not isinstance(episode, int) or not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    length = int(source.lengths[episode])
+    step = length - 1 if step is None else step
+    if not isinstance(step, int) or not 0 <= step < length:
+        raise UserError(f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}.")
+    return episode, step
+
+
+def build_memory(cfg: DictConfig) -> "Memory":
+    """The memory the configuration names, of any width: it is only asked to select."""
+    from mme_vla.backbone.config import shape_of
+    from mme_vla.policy import mme
+
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    backbone = shape_of(config["backbone"])
+    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.vision_width)
+
+
+def draw_memory(
+    source: "EpisodeSource",
+    episode: int,
+    step: int,
+    memory: "Memory",
+    name: str,
+    folder: Path,
+    console: "Console",
+) -> Path:
+    """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
+    from mme_vla.data.memory_image import memory_sheet
+    from mme_vla.memory.history import OnlineHistory
+
+    frames = source.frames(episode, np.arange(step + 1))
+    history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
+    stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
+    history.append(frames, _no_tokens(len(stored), patches))
+    selected = memory.select(history, step)
+    remembered = np.unique(selected[:, 0])
+    table = _table(f"{name} at step {step}", "", "")
+    table.add_row("remembers", f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames")
+    table.add_row("frames", ", ".join(map(str, remembered)))
+    table.add_row("stored", f"{len(stored)} frames of {memory.storage.grid}×{memory.storage.grid} tokens")
+    _show(table, console)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
+    title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
+    start = int(source.exec_starts[episode])
+    memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
+    return path
+
+
+def _no_tokens(frames: int, patches: int) -> Any:
+    import torch
+
+    return torch.zeros(frames, patches, 1)  # selections do not read tokens
+
+
+def _parts(policy: "Policy") -> dict[str, list[Any]]:
+    """Parameters by the parts of fine-tuning, in the policy's order."""
+    groups: dict[str, list[Any]] = {}
+    for name, parameter in policy.named_parameters():
+        groups.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
+    return groups
+
+
+def _table(title: str, *columns: str) -> "Table":
+    from rich.table import Table
+
+    table = Table(title=printable(title), show_header=any(columns))
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right")
+    return table
+
+
+def _show(table: "Table", console: "Console") -> None:
+    """Print a table under its title, which may be wider: a path is not broken."""
+    console.print(table.title, style="bold", markup=False, highlight=False, soft_wrap=True)
+    table.title = None
+    console.print(table)
+
+
+def _summary(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key}={_summary(inner) if not isinstance(inner, dict) else '{' + _summary(inner) + '}'}"
+                         for key, inner in value.items())  # fmt: skip
+    return printable(str(value))
+
+
+def _numbers(values: np.ndarray, names: Sequence[str]) -> str:
+    """Numbers behind their names, where they have names."""
+    if not names:
+        return ", ".join(f"{x:.3f}" for x in values)
+    return ", ".join(f"{name}: {x:.3f}" for name, x in zip(names, values, strict=True))

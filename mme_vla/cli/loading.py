@@ -1,0 +1,114 @@
+"""The policy a command is about: a checkpoint, or a model with fresh weights for trying things out."""
+
+import logging
+import time
+from typing import TYPE_CHECKING, NamedTuple
+
+from omegaconf import DictConfig
+
+from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    import torch
+
+    from mme_vla.policy.base import Policy
+
+# What a checkpoint brings along, so that it cannot be set beside one.
+_MODEL_KEYS = (
+    "name",
+    "model",
+    "embodiment",
+    "backbone",
+    "memory",
+    "integration",
+    "policy",
+    "processor",
+    "subgoal_text",
+    "token_budget",
+)
+
+
+class LoadedPolicy(NamedTuple):
+    """A policy on its device. source: the checkpoint folder or repository it is from; None with fresh weights."""
+
+    policy: "Policy"
+    name: str
+    source: str | None
+
+
+def load_policy(
+    cfg: DictConfig, verb: str, logger: logging.Logger, device: "torch.device | None" = None
+) -> LoadedPolicy:
+    """Load `checkpoint`, or build `model` with fresh weights and say so.
+
+    Args:
+        cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from.
+        verb: what the command does with it, for messages. device: instead of the configured one.
+    """
+    from mme_vla.policy.base import Policy
+    from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.run_folders import locate_checkpoint
+
+    device = find_device(cfg.device) if device is None else device
+    named = words_of(*_MODEL_KEYS)
+    if cfg.checkpoint is not None:
+        if named:
+            raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
+        where = locate_checkpoint(str(cfg.checkpoint))
+        policy = Policy.from_pretrained(
+            where, device=device, dtype=cfg.dtype, revision=cfg.revision, trust_plugins=cfg.trust_plugins
+        )
+        name = str(policy.config.get("name", "policy"))
+        logger.info("%s from %s, on %s", name, where, device)
+        return LoadedPolicy(policy, name, where)
+    if not any(word.startswith("model=") for word in named):
+        raise UserError(
+            f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out."
+        )
+    from mme_vla.testing.small import unit_stats
+
+    if cfg.dtype not in ("auto", "float32"):
+        raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
+    policy = build_from_config(cfg).to(device)
+    policy.require_processor().stats = unit_stats(policy.embodiment)
+    logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
+    return LoadedPolicy(policy, str(cfg.name), None)
+
+
+SAMPLING = ("auto", "eager", "graph", "compiled")
+"""How a command computes chunks: `sampling` of configs/evaluate.yaml and configs/serve.yaml."""
+
+
+def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) -> None:
+    """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
+    from mme_vla.policy.capabilities import CompilesSampling
+
+    if sampling not in SAMPLING:
+        raise UserError(f"sampling={sampling!r}. {did_you_mean(str(sampling), SAMPLING)}")
+    on_gpu = policy.device.type == "cuda"
+    if sampling == "graph" and not on_gpu:
+        raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")
+    compiles = isinstance(policy, CompilesSampling)
+    if sampling == "eager" or (sampling == "auto" and not (on_gpu and compiles and policy.compiles_sampling)):
+        return
+    if not isinstance(policy, CompilesSampling):
+        raise UserError(
+            f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set sampling=eager."
+        )
+    begun = time.perf_counter()
+    policy.compile_sampling(layers=sampling == "compiled")
+    logger.info("sampler compiled in %.1f s (sampling=%s)", time.perf_counter() - begun, sampling)
+
+
+def words_of(*keys: str) -> list[str]:
+    """The words of the command line that set one of these keys or groups, or something below."""
+    from hydra.core.hydra_config import HydraConfig
+
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    matches = []
+    for word in overrides:
+        key = word.lstrip("+~").split("=")[0]
+        if any(key == name or key.startswith((f"{name}.", f"{name}@")) for name in keys):
+            matches.append(word)
+    return matches

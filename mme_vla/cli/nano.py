@@ -1,0 +1,227 @@
+"""`python -m mme_vla.nano task=VideoUnmask model=framesamp_modul`: from nothing to a page of results on two cores."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli
+from mme_vla.config.composition import command_trees, config_dir
+from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.utils import read_json, write_json
+
+if TYPE_CHECKING:
+    from mme_vla.embodiment import Embodiment
+    from mme_vla.envs.recording.frames import FrameChoice
+    from mme_vla.evaluation.records import EpisodeRecord
+    from mme_vla.nano.demonstrations import Scene
+
+# Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+SEEDS_APART = 100_000  # first seeds of two difficulties
+RETRIES = 20  # scenes in a row that no demonstration succeeds in
+
+
+def main() -> None:
+    """Run the command with the task's own settings, where it has a file of them."""
+    sys.argv[1:] = with_settings(sys.argv[1:])
+    command()
+
+
+def with_settings(words: Sequence[str]) -> list[str]:
+    """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more.
+
+    `nano=null` does without it. `model=…` would be a choice for a tree that holds one model; here it names the first of
+    several.
+    """
+    words = [f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word for word in words]
+    if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
+        return [word for word in words if word != "nano=null"]
+    tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    task_file = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
+    if task_file is None or not task_file.is_file() or any(word.startswith("nano=") for word in words):
+        return list(words)
+    return [f"nano={task_file.stem}", *words]
+
+
+@cli("nano")
+def command(cfg: DictConfig) -> None:
+    """Record, train, evaluate and write the page, each as far as it is not there."""
+    from mme_vla.envs.make import check_names, require_simulator
+
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    check_names(config["task"], "mme_vla", "waypoint", None, None)
+    check_counts(config["demonstrations"])
+    require_simulator()
+    run({str(key): value for key, value in config.items()}, command_trees()[1:])
+
+
+def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
+    """All stages of a run; the path of its page; of a folder, where other commands are to continue there.
+
+    Args:
+        config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
+    """
+    from mme_vla.embodiment import Embodiment
+    from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
+    from mme_vla.nano.evaluating import NAME as PLANNER
+    from mme_vla.nano.evaluating import record_videos, run_episodes
+    from mme_vla.nano.fitting import compose_policy, train
+    from mme_vla.nano.page import write_page
+
+    folder = Path(config["output"])
+    folder.mkdir(parents=True, exist_ok=True)
+    words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
+    words += config["overrides"]
+    models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
+    how = (config["memories"], words, extra_dirs, config["plugins"])
+    composed = {model: compose_policy(model, *how) for model in models}
+    render_for = [model for model in config["drawn_for"] if model not in composed]
+    minutes = _Minutes(folder / "minutes.json")
+    with minutes.of("demonstrations"):
+        others = [compose_policy(model, *how) for model in render_for]
+        memories = [each["memory"] for each in (*composed.values(), *others)]
+        robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
+        execute = robot.action.execute
+        choices = [FrameChoice(DECISIONS, memory, execute) for memory in [None, *filter(None, memories)]]
+        files = record_all(config, folder / "demonstrations", choices, robot)
+    if config["record_only"]:
+        return folder / "demonstrations"
+    records: dict[str, list[EpisodeRecord]] = {}
+    videos: list[Path] = []
+    for model, each in composed.items():
+        with minutes.of(f"training {model}"):
+            checkpoint = train(each, config["train"], folder / model, files, config["learning"])
+        with minutes.of(f"evaluation {model}"):
+            records[model] = run_episodes(
+                checkpoint, folder / model / config["split"], config["task"], split=config["split"],
+                episodes=config["also_episodes" if model in config["also"] else "episodes"],
+                seeds=config["policy_seeds"], workers=config["workers"], max_steps=config["max_steps"],
+                shard=config["shard"],
+            )  # fmt: skip
+        if model == config["with_memory"] and config["films"] and config["shard"] is None:
+            with minutes.of("films"):
+                videos = record_videos(checkpoint, folder / "films", records[model])
+    if config["shard"] is not None:
+        return folder
+    if config["planner"]:
+        with minutes.of("evaluation planner"):
+            records[PLANNER] = plan_all(config, folder / "planner" / config["split"])
+    blind = [model for model, each in composed.items() if each["memory"] is None and not each["subgoal_text"]]
+    page = write_page(folder, config, records, next(iter(blind), None), minutes.spent, videos)
+    print(page)
+    return page
+
+
+def plan_all(config: Mapping[str, Any], folder: Path) -> "list[EpisodeRecord]":
+    """The oracle bracket: the demonstrator's motions on every episode, unless `folder` has its record; all records."""
+    from mme_vla.cli.record import carry_out
+    from mme_vla.envs.episodes import choose_episodes
+    from mme_vla.evaluation.store import RecordLog, read_records
+    from mme_vla.nano.evaluating import Replay, replay
+
+    file = folder / "episodes.jsonl"
+    known = {record.episode for record in (read_records(file) if file.is_file() else ())}
+    specs = choose_episodes(config["task"], config["episodes"], config["split"])
+    missing = [Replay(spec, config["max_steps"]) for spec in specs if spec.episode not in known]
+    with RecordLog(file) as log:
+        for record in carry_out(missing, replay, config["workers"]):
+            log.append(record)
+    numbers = {spec.episode for spec in specs}
+    return [record for record in read_records(file) if record.episode in numbers]
+
+
+def check_counts(counts: Any) -> None:
+    """Make sure that demonstrations are asked for as difficulty: how many."""
+    known = ("easy", "medium", "hard")
+    if not isinstance(counts, Mapping) or not all(isinstance(n, int) and n >= 0 for n in counts.values()):
+        raise UserError(f"demonstrations={brief(counts)}: write how many of each difficulty, such as {{easy: 100}}.")
+    for level in counts:
+        if level not in known:
+            raise UserError(f"Unknown difficulty {brief(level)}. {did_you_mean(str(level), known)}")
+    if sum(counts.values()) < 2:
+        raise UserError(f"demonstrations={brief(counts)}: it takes two, to learn from and to measure by.")
+
+
+def record_all(
+    config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", robot: "Embodiment"
+) -> list[Path]:
+    """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
+
+    Args:
+        choices: what the memories that will train on them read. robot: the one that does.
+    """
+    from mme_vla.data.console import progress
+    from mme_vla.nano.demonstrations import Scene
+
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = tuple(robot.camera_names)
+    counts: dict[str, int] = config["demonstrations"]
+    files: list[Path] = []
+    with progress("record", sum(counts.values()), unit="demonstrations") as advance:
+        for number, (level, n_required) in enumerate(counts.items()):
+            first = int(config["first_seed"]) + number * SEEDS_APART
+            how = (cameras, tuple(choices), config["carried_out"], robot.action)
+            scene = Scene(config["task"], first, level, folder, *how)
+            scenes = (replace(scene, seed=seed) for seed in count(first))
+            files += demonstrate(scenes, n_required, config["workers"], advance)
+    return files
+
+
+def demonstrate(
+    scenes: "Iterator[Scene]", count: int, workers: int = 1, advance: Callable[[int], None] = lambda _: None
+) -> list[Path]:
+    """The files of the first demonstrations of these scenes that succeed; existing ones are not made again."""
+    from mme_vla.cli.record import carry_out
+    from mme_vla.nano.demonstrations import demonstrated
+
+    files: list[Path] = []
+    failed = 0
+    while len(files) < count:
+        some = list(islice(scenes, min(RETRIES - failed, count - len(files))))
+        missing = [scene for scene in some if not scene.tried]
+        advance(sum(scene.path.is_file() for scene in some if scene.tried))
+        for made in carry_out(missing, demonstrated, workers):
+            advance(int(made))
+        new = [scene.path for scene in some if scene.path.is_file()]
+        files += new
+        failed = 0 if new else failed + len(some)
+        if failed >= RETRIES:
+            last = some[-1]
+            raise UserError(
+                f"{last.task}: {failed} {last.difficulty} scenes in a row, to seed {last.seed}, cannot be demonstrated."
+            )
+    return files
+
+
+class _Minutes:
+    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors for this process."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @property
+    def spent(self) -> dict[str, list[float]]:
+        """Stage → minutes on the clock, and of this process; other runs of the command may add to them meanwhile."""
+        return read_json(self._path, "minutes of a run") if self._path.is_file() else {}
+
+    @contextmanager
+    def of(self, stage: str) -> Iterator[None]:
+        """Time what happens inside; a stage that had nothing to do counts its moment."""
+        begun = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            now = time.perf_counter(), time.process_time()
+            spent = self.spent
+            before = spent.get(stage, [0.0, 0.0])
+            spent[stage] = [old + (b - a) / 60 for old, a, b in zip(before, begun, now, strict=True)]
+            write_json(self._path, spent)

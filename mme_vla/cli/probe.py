@@ -1,0 +1,103 @@
+"""`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory (configs/probe.yaml)."""
+
+import logging
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
+from mme_vla.cli.loading import load_policy
+from mme_vla.errors import UserError
+
+if TYPE_CHECKING:
+    from mme_vla.evaluation.recordings import Recording
+    from mme_vla.policy.base import Policy
+
+# Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+logger = logging.getLogger("mme_vla.probe")
+
+
+@cli("probe")
+def main(cfg: DictConfig) -> None:
+    """Probe what has no result yet, and write the page."""
+    from mme_vla.envs.episodes import named_tasks
+    from mme_vla.envs.make import require_simulator
+    from mme_vla.evaluation.rollout.evaluation import (
+        RunFacts,
+        checkpoint_label,
+        choose_episodes,
+        choose_shard,
+        memory_budget,
+    )
+    from mme_vla.evaluation.rollout.settings import RolloutSettings
+    from mme_vla.policy.saving import composition_digest
+    from mme_vla.probing.offline import OfflineSettings
+    from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
+    from mme_vla.utils import safe_name
+
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    values: dict[str, Any] = {str(key): value for key, value in config.items()}
+    if values["compare"] is not None:
+        print(_table(values["compare"]))
+        return
+    if not (values["offline"] or values["online"]):
+        raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
+    if values["offline"] and values["recordings"] is None:
+        raise UserError(NO_DATA)
+    settings = RolloutSettings.from_config(values)
+    offline = OfflineSettings.from_config(values)
+    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split) if values["online"] else []
+    shard = choose_shard(values["shard"])
+    if jobs and settings.env == "mme_vla":
+        require_simulator()
+    log_to_terminal(logger)
+    device = choose_device(str(cfg.device))
+    policy, name, source = load_policy(cfg, "probe", logger, device)
+    recordings = _recordings(values["recordings"], policy)
+    probed = _select(recordings, values["recorded"]) if values["offline"] else []
+    subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device) if jobs else None
+    facts = RunFacts(
+        name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
+        None if subgoals is None else str(values["subgoal"]["name"]), memory_budget(policy),
+        composition_digest(policy.config),
+    )  # fmt: skip
+    folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
+    folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
+    logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source)
+    try:
+        report = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals)
+    finally:
+        if subgoals is not None:
+            report_usage(subgoals.usage)
+            subgoals.close()
+    print((report.page.parent / "table.md").read_text(encoding="utf-8"))
+    print(report.page)
+
+
+def _recordings(data: Any, policy: "Policy") -> "list[Recording]":
+    from mme_vla.data.sources import open_sources
+    from mme_vla.evaluation.recordings import all_recordings
+
+    return [] if data is None else all_recordings(open_sources(data, policy.embodiment))
+
+
+def _select(recordings: "list[Recording]", which: Any) -> "list[Recording]":
+    """The recorded episodes that are probed, by the grammar of all commands."""
+    from mme_vla.envs.episodes import choose_numbers
+
+    return [recordings[i] for i in choose_numbers(which, len(recordings), "the data")]
+
+
+def _table(folders: Any) -> str:
+    from mme_vla.probing.report import table_of
+    from mme_vla.probing.run import probed_folder
+
+    listed = [folders] if isinstance(folders, str) else list(folders)
+    return table_of({folder: probed_folder(Path(folder)) for folder in listed})

@@ -1,0 +1,266 @@
+"""`mme-vla record`: demonstrate episodes of the benchmark and keep them as a dataset."""
+
+import gc
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
+
+from mme_vla.config.plugins import import_plugins, imported_plugins
+from mme_vla.envs.episodes import choose_episodes, named_tasks
+from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.envs.recording.frames import FrameChoice
+from mme_vla.envs.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
+from mme_vla.errors import UserError
+from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
+from mme_vla.utils.processes import end_with_parent, signals_deferred
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from mme_vla.envs.recording.recorder import Recording
+
+
+KEYS = ("frames", "memory")
+FAILED = "the demonstration did not end in success"
+
+
+def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
+    """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
+
+    Where the rendered frames depend on the demonstration, it is made twice: first without images, to choose the frames,
+    and again with images of them.
+
+    Returns:
+        Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
+    """
+    from mme_vla.envs.recording.outputs import EpisodeWriter
+    from mme_vla.envs.recording.recorder import Recorder
+    from mme_vla.envs.scene.placement import SceneError
+
+    failures: dict[int, str] = {}
+    draft = folder / f"{job.name}.writing"
+    for seed in range(job.seed, job.seed + job.retries):
+        scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
+        blind: Recording | None = None
+        try:
+            request = None if job.frames is None else job.frames.beforehand()
+            if job.frames is not None and request is None:
+                blind = _unseen(job.task, scene)
+                if not blind.success:
+                    failures[seed] = blind.error or FAILED
+                    continue
+                request = job.frames.render_request(blind.frames)
+            task = make_task(job.task, render=True, **scene)
+        except SceneError as error:
+            failures[seed] = str(error)
+            continue
+        writer = EpisodeWriter(draft, job.episode, task, job.frames)
+        try:
+            result: Recording = Recorder(task, on_step=writer.add, render_request=request).record()
+        finally:
+            writer.close()
+            task.close()
+        if blind is not None and (blind.steps, blind.stored) != (result.steps, result.stored):
+            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when rendered.")
+        if result.success:
+            draft.rename(folder / f"{job.name}.h5")
+            if previews is not None:
+                from mme_vla.data.convert import write_previews
+
+                write_previews(folder / f"{job.name}.h5", job.episode, job.task, previews)
+            counts = {"steps": result.steps, "stored": result.stored, "video": result.video}
+            done = {"task": job.task, "episode": job.episode, "seed": seed, **counts, "failed_seeds": failures}
+            write_json(folder / f"{job.name}.json", done, indent=None)  # last: what it tells of is there
+            return done
+        failures[seed] = result.error or FAILED
+    draft.unlink(missing_ok=True)
+    last = list(failures.items())[-1]
+    raise UserError(
+        f"{job.task} episode {job.episode}: none of the seeds {job.seed} … {last[0]} succeeded; the last: {last[1]}. "
+        "Raise retries, or leave this episode out."
+    )
+
+
+def _unseen(task: str, scene: dict[str, Any]) -> "Recording":
+    """The same demonstration without images, its steps in memory."""
+    from mme_vla.envs.recording.recorder import Recorder
+
+    env = make_task(task, render=False, **scene)
+    try:
+        return Recorder(env, render=False).record()
+    finally:
+        env.close()
+
+
+def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None) -> list[dict[str, Any]]:
+    """Demonstrate all episodes that `folder` does not hold yet, with a progress bar; return what is known of each."""
+    from mme_vla.data.console import progress
+
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [job for job in jobs if not (folder / f"{job.name}.json").is_file()]
+    with progress("record", len(jobs), len(jobs) - len(missing), "episodes") as advance:
+        for _ in carry_out(missing, partial(record_episode, folder=folder, previews=previews), workers):
+            advance(1)
+    return [read_json(folder / f"{job.name}.json", "what is known of a recorded episode") for job in jobs]
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    begun = (settings(), _begin_worker, imported_plugins())
+    return ProcessPoolExecutor(workers, simulating_processes(), begin, begun)
+
+
+def report_coverage(
+    tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int, split: str = "test"
+) -> None:
+    """Say which goals of a split the recorded episodes lack, and write it as JSON.
+
+    Args:
+        plan: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
+    """
+    from mme_vla.data.console import progress
+    from mme_vla.envs.recording.coverage import compare, goal_of, goals_recorded, in_words
+
+    specs, goals = choose_episodes(tasks, None, split), []
+    with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
+        with signals_deferred():
+            run = map if workers == 1 else stack.enter_context(_pool(workers)).map
+            episode_goals = run(goal_of, specs)
+        for goal in episode_goals:
+            goals.append(goal)
+            advance(1)
+    official = [place for place in plan.places if place != plan.dataset]
+    coverage = compare(goals_recorded(plan.dataset, official), zip(specs, goals, strict=True))
+    write_json(file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1)
+    print(f"{in_words(coverage, split)}\n{file}")
+
+
+def _begin_worker(plugins: Sequence[str]) -> None:
+    """A worker process ends with the one that started it, and knows the same tasks."""
+    end_with_parent()
+    import_plugins(plugins)
+
+
+def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
+    """Do work that simulates, in so many processes; what came of it, as it is done.
+
+    Args:
+        work: importable by name, or a partial of such, where there are several processes.
+    """
+    if workers == 1 or len(jobs) < 2:
+        import mme_vla.envs.task  # noqa: F401
+
+        gc.freeze()  # scenes are built faster when no collection walks through the simulator's modules
+        yield from map(work, jobs)
+        return
+    with _pool(workers) as pool:
+        with signals_deferred():  # the workers are started here, and inherit that
+            futures = [pool.submit(work, job) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException as error:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: it is not awaited
+                for worker in multiprocessing.active_children():
+                    worker.terminate()
+            raise
+
+
+def plan(cfg: "DictConfig") -> list[Job]:
+    """The episodes that a configuration names."""
+    for name in ("workers", "retries"):
+        if not isinstance(cfg[name], int) or cfg[name] < 1:
+            raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
+    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
+    frames = _frame_choice(cfg)
+    return [
+        Job(s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None, cfg.retries, frames)
+        for s in specs
+    ]
+
+
+def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
+    frames: Any
+    memory: Any
+    frames, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
+    if frames == "all":
+        if memory is not None:
+            raise UserError("frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
+        return None
+    return FrameChoice(frames, memory)
+
+
+def run(cfg: "DictConfig") -> None:
+    """Record as configs/record.yaml and the command line say; what the same words have recorded stays as it is."""
+    from mme_vla.config.sections import read_section
+    from mme_vla.data.convert import ConvertOptions
+
+    if not cfg.lerobot and cfg.hdf5 is None:
+        raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
+    options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names)
+    jobs = plan(cfg)
+    recording_plan = RecordingPlan(
+        jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5)
+    )
+    places = ", ".join(map(str, recording_plan.places))
+    work = Path(cfg.output).with_name(Path(cfg.output).name + ".recording")
+    if not recording_plan.missing(options) and not work.exists():
+        print(f"{places}: {len(jobs)} episodes, all there already.")
+        if cfg.coverage is not None:
+            require_simulator()
+            report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
+        return
+    require_simulator()
+    with FolderLock(work, "recording"):
+        _claim(work, jobs)
+        missing = recording_plan.missing(options)  # asked again: another process may have finished it meanwhile
+        if missing:
+            previews = None if cfg.previews is None else Path(cfg.previews)
+            begun, there = time.perf_counter(), {path.stem for path in (work / "episodes").glob("*.json")}
+            done = record(jobs, work / "episodes", cfg.workers, previews)
+            seconds = time.perf_counter() - begun
+            recording_plan.write(missing, work / "episodes", options)
+            steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
+            print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
+            if new := [d for job, d in zip(jobs, done, strict=True) if job.name not in there]:
+                print(_throughput(len(new), sum(d["stored"] for d in new), seconds, cfg.workers))
+        else:
+            print(f"{places}: {len(jobs)} episodes, all there already.")
+        recording_plan.tidy()
+        drop_plan(work)
+    if cfg.coverage is not None:
+        report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
+
+
+def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
+    """A line on the speed; of a resumed recording, on what was added."""
+    hours = max(seconds, 1e-9) / 3600
+    named = f"{workers} worker{'s'[: workers > 1]}"
+    return (
+        f"{episodes} episodes in {seconds:.0f} s with {named}: {episodes / hours:,.0f} episodes and "
+        f"{steps / hours:,.0f} steps an hour."
+    )
+
+
+def _claim(work: Path, jobs: Sequence[Job]) -> None:
+    """Make `work` the folder of these episodes, or recognise it as such."""
+    if not claim_plan(work, [job.plan for job in jobs]):
+        raise UserError(
+            f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
+            "another output, or remove that folder yourself."
+        )
+
+
+def main() -> None:
+    """Run `mme-vla record`."""
+    from mme_vla.cli.command import cli
+
+    cli("record")(run)()

@@ -1,0 +1,190 @@
+"""`python -m mme_vla.results RUN…`: from episode records to tables and a report, beside the paper's numbers.
+
+RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or below; shards and runs are merged.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import argument_parser
+from mme_vla.envs.metadata import FURTHER_SPLITS
+from mme_vla.errors import UserError, printable
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.curves import Curves, process_tables, stress_curves, stress_figures, stress_table
+from mme_vla.evaluation.results.paper import demo_records
+from mme_vla.evaluation.results.report import read_runs, training_details
+from mme_vla.evaluation.results.scopes import TEST_EPISODES, Protocol, tasks_of
+from mme_vla.evaluation.results.tables import (
+    Table,
+    comparison_table,
+    detail,
+    leaderboard,
+    overview,
+    print_table,
+    runs_table,
+    to_csv,
+    to_latex,
+    to_markdown,
+)
+from mme_vla.evaluation.rollout.subgoals import subgoal_tables
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.utils.pages import render
+
+DEMO = (
+    ("pi05", None),
+    ("groundsg", "qwenvl"),
+    ("tokendrop_modul", None),
+    ("framesamp_modul", None),
+    ("ttt_expert", None),
+)
+
+
+EXAMPLES = (
+    "outputs/evaluation --html report.html",
+    "runs/a runs/b --compare framesamp_modul pi05",
+    "--demo --brief",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read, aggregate, compare, print, write."""
+    args = _parser().parse_intermixed_args(arguments)
+    with print_user_errors():
+        run(args)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Do what the parsed command line says."""
+    from rich.console import Console
+
+    if args.demo == bool(args.runs):
+        raise UserError("Name files or folders of episode records, or --demo for synthetic ones (not both).")
+    records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
+    protocol = Protocol(
+        tuple(args.tasks or tasks_of(records)), args.episodes or _episodes(records, args.split), args.errors,
+        args.confidence, args.samples, args.seed,
+    )  # fmt: skip
+    if args.stress:
+        show_curves(stress_curves(records, args.confidence, args.conflicts), args)
+        return
+    results = aggregate(records, protocol, args.split, args.conflicts)
+    if any(record.extra.get("made_up") for record in records):
+        results.notes.insert(0, "Made-up records, drawn from the paper's rates: not a result of anything.")
+    comparisons = compare_all(_pairs(results, args.compare), protocol)
+    # Piped into a file there is no terminal to fit: as wide as the tables are.
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    for table in _tables(results, comparisons, detailed=not args.brief):
+        print_table(table, console.width)
+    for comparison in comparisons:
+        console.print(printable(comparison.verdict), markup=False, highlight=False)
+    for note in results.notes:
+        console.print(printable(f"• {note}"), markup=False, highlight=False, soft_wrap=True)
+    for path in write(results, comparisons, args):
+        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
+    """Episodes of a task in the split that the records are of."""
+    splits = {record.split for record in records if split in (None, record.split)}
+    counts = {FURTHER_SPLITS.get(str(name), TEST_EPISODES) for name in splits}
+    return counts.pop() if len(counts) == 1 else TEST_EPISODES
+
+
+def show_curves(curves: Curves, args: argparse.Namespace) -> None:
+    """Print success over the dials, and write it where a file is named."""
+    from mme_vla.evaluation.results.report import Section, html_page
+
+    table = stress_table(curves)
+    print_table(table, 200)
+    if args.markdown:
+        args.markdown.parent.mkdir(parents=True, exist_ok=True)
+        args.markdown.write_text(to_markdown(table), encoding="utf-8")
+    if args.html:
+        caption = "Episodes that every place of the dial has."
+        boxes = [Section(name, figure, caption=caption) for name, figure in stress_figures(curves).items()]
+        args.html.parent.mkdir(parents=True, exist_ok=True)
+        page = html_page(args.title, [*boxes, Section(table.title, tables=[table])])
+        args.html.write_text(page, encoding="utf-8")
+
+
+def write(results: Results, comparisons: list[Comparison], args: argparse.Namespace) -> list[Path]:
+    """Write the files asked for; return their paths."""
+    texts: dict[Path, str] = {}
+    if args.csv:
+        texts[args.csv] = to_csv(results)
+    if args.latex:
+        texts[args.latex] = "\n".join(to_latex(table) for table in _tables(results, comparisons))
+    if args.markdown:
+        boards = [table for method in results.methods for table in leaderboard(method, results)]
+        tables = [overview(results), *boards, *process_tables(results), *subgoal_tables(results)]
+        texts[args.markdown] = render(
+            "results.md",
+            tables=map(to_markdown, tables),
+            training=training_details(results.methods, read_runs(find_records(args.runs))),
+            comparisons=[to_markdown(comparison_table(comparisons))] if comparisons else [],
+            notes=results.notes,
+        )
+    if args.html:
+        from mme_vla.evaluation.results.report import html_report
+
+        texts[args.html] = html_report(results, comparisons, args.title)
+    for path, text in texts.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return list(texts)
+
+
+def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
+    tables = [overview(results)]
+    if detailed:
+        tables = [
+            *(detail(method, results) for method in results.methods),
+            *process_tables(results),
+            *subgoal_tables(results),
+            runs_table(results),
+            *tables,
+        ]
+    return [*tables, comparison_table(comparisons)] if comparisons else tables
+
+
+def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[tuple[Method, Method]]:
+    """The pairs asked for; unasked, two methods alone where they share episodes, and otherwise a note."""
+    if requested is not None:
+        return [(results.method(first), results.method(second)) for first, second in requested]
+    if len(results.methods) != 2:
+        return []
+    first, second = results.methods
+    if common_episodes(first, second):
+        return [(first, second)]
+    results.notes.append(f"{first.label} and {second.label} have no episode in common, and are not compared.")
+    return []
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argument_parser("python -m mme_vla.results", __doc__, EXAMPLES)
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="file of episode records, or folder")
+    parser.add_argument("--compare", nargs=2, action="append", metavar=("A", "B"), help="pair two methods; repeatable")
+    parser.add_argument("--csv", type=Path, help="every figure, one a row")
+    parser.add_argument("--latex", type=Path, help="tables for a paper (booktabs)")
+    parser.add_argument("--markdown", type=Path, help="tables in the leaderboard's format")
+    parser.add_argument("--html", type=Path, help="one self-contained page with plots")
+    parser.add_argument("--title", default="RoboMME results", help="of the page")
+    parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
+    parser.add_argument("--brief", action="store_true", help="print the overview only")
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)")
+    parser.add_argument("--episodes", type=int, help="episodes of a task (default: as the split has)")
+    parser.add_argument("--split", help="test, val or train, where there are records of several")
+    parser.add_argument("--errors", default="failure", choices=("failure", "missing"),
+                        help="episodes that ended in an error count as failures (default), or as not run")  # fmt: skip
+    parser.add_argument("--conflicts", default="refuse", choices=("refuse", "first", "last"),
+                        help="an episode evaluated twice with different outcomes (default: %(default)s)")  # fmt: skip
+    parser.add_argument("--confidence", type=float, default=0.95, help="level of intervals and tests")
+    parser.add_argument("--samples", type=int, default=10_000, help="of the bootstrap")
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
+    parser.add_argument("--demo", action="store_true", help="synthetic records with the paper's success rates")
+    return parser

@@ -1,0 +1,66 @@
+"""`python -m mme_vla.serve checkpoint=…`: serve a policy (configs/serve.yaml)."""
+
+import asyncio
+import logging
+import os
+import signal
+from typing import TYPE_CHECKING
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.cli.loading import load_policy, prepare_sampling
+
+if TYPE_CHECKING:
+    from mme_vla.serving.server import PolicyServer
+
+# Threads that wait asleep leave the event loop its core; it counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+logger = logging.getLogger("mme_vla.serving")
+
+
+@cli("serve")
+def main(cfg: DictConfig) -> None:
+    """Serve `checkpoint`, or a fresh `model`, until SIGTERM or Ctrl-C."""
+    from mme_vla.serving.server import PolicyServer
+    from mme_vla.serving.settings import ServeSettings
+
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    settings = ServeSettings.from_dict({str(key): value for key, value in config.items()})
+    log_to_terminal(logger, clock=True)
+    policy, name, _ = load_policy(cfg, "serve", logger)
+    prepare_sampling(policy, cfg.sampling, logger)
+    server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
+    if not settings.local_only and settings.api_key is None:
+        logger.warning("host=%s without api_key: every client that reaches this port can use it", settings.host)
+    if server.metadata["subgoal"] is not None:
+        logger.info("reads the key %r of each request; without it, the goal alone", server.metadata["subgoal"])
+    asyncio.run(run(server))
+
+
+async def run(server: "PolicyServer") -> None:
+    """Start, wait for SIGTERM or Ctrl-C, stop; a second signal does not wait for what is running."""
+    loop, stop_requested = asyncio.get_running_loop(), asyncio.Event()
+    serving = asyncio.current_task()
+    assert serving is not None
+
+    def stop() -> None:
+        if stop_requested.is_set():
+            serving.cancel()
+        stop_requested.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop)
+    await server.start()
+    host = f"[{server.settings.host}]" if ":" in server.settings.host else server.settings.host
+    logger.info("ready at ws://%s:%d and http://%s:%d (healthz, metadata, stats)", *(host, server.port) * 2)
+    await stop_requested.wait()
+    logger.info("stopping: no new clients, requests that are running are finished")
+    try:
+        await server.stop()
+    except asyncio.CancelledError:
+        logger.warning("stopped at once; requests were cut off")
+        os._exit(1)  # the policy's thread cannot be interrupted
+    logger.info("stopped · %s", server.stats.line())

@@ -1,0 +1,46 @@
+"""`mme-vla subgoal-build input=… output=…`: training data of the subgoal predictors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli
+from mme_vla.config.sections import NonNegativeInt, read_section
+from mme_vla.subgoal.finetuning.collecting import build, open_input
+from mme_vla.subgoal.finetuning.rows import RowOptions
+from mme_vla.subgoal.finetuning.training import write_arguments
+
+
+@dataclass(frozen=True)
+class BuildSettings:
+    """The keys of configs/subgoal_build.yaml."""
+
+    input: str | tuple[str, ...]
+    output: str
+    sets: tuple[Literal["simple", "grounded", "memer", "memer_simple"], ...]
+    episodes: tuple[NonNegativeInt, ...] | None
+    tasks: str | None
+    noise: tuple[int, int] | None
+    rows: Mapping[str, Any]
+    seed: NonNegativeInt
+
+
+@cli("subgoal_build")
+def main(cfg: DictConfig) -> dict[str, int]:
+    """Build what configs/subgoal_build.yaml and the command line say."""
+    settings = read_section(BuildSettings, OmegaConf.to_container(cfg, resolve=True), others=True)
+    options = read_section(RowOptions, settings.rows, "rows", noise=settings.noise, seed=settings.seed)
+    inputs = (settings.input,) if isinstance(settings.input, str) else settings.input
+    tasks = None if settings.tasks is None else Path(settings.tasks)
+    episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
+    if settings.episodes is not None:
+        episodes = [episode for episode in episodes if episode.number in settings.episodes]
+    output = Path(settings.output)
+    counts = build(episodes, output, settings.sets, options)
+    for name, count in counts.items():
+        write_arguments(output, name)
+        print(f"{output / name}.jsonl: {count} rows of {len(episodes)} episodes")
+    return counts

@@ -1,0 +1,172 @@
+"""`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
+
+import os
+import shlex
+import sys
+import time
+from contextlib import ExitStack, nullcontext, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.cli.command import cli
+from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError
+from mme_vla.utils import remove_drafts, write_atomically
+
+if TYPE_CHECKING:
+    from mme_vla.training.loop import Trainer
+    from mme_vla.training.runs import Run
+    from mme_vla.training.settings import TrainSettings
+
+# Threads that wait for each other asleep: busy waiting slows a step tenfold when anything else runs on the same cores
+# (data workers do). It counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+@cli("train")
+def main(cfg: DictConfig) -> None:
+    """Train from the beginning, or continue with a run that was interrupted."""
+    from hydra.core.hydra_config import HydraConfig
+
+    begun, named = time.perf_counter(), True
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    fresh = Path(config["output"])
+    if HydraConfig.initialized():
+        fresh = Path(HydraConfig.get().runtime.output_dir)
+        named = any(word.startswith("output=") for word in HydraConfig.get().overrides.task)
+    try:
+        train(cfg, {str(key): value for key, value in config.items()}, fresh, begun, named)
+    except UserError:
+        with suppress(OSError):
+            fresh.rmdir()  # Hydra made it; it stays if it holds anything
+        raise
+
+
+def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, named: bool = True) -> Path:
+    """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
+
+    Args:
+        named: whether the user chose the folder's name; another run may have begun in the same second.
+
+    Returns:
+        The last checkpoint.
+
+    Raises:
+        SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the signal's number.
+    """
+    from accelerate import Accelerator
+    from accelerate.utils import DistributedDataParallelKwargs, broadcast_object_list
+
+    from mme_vla.training.logging import check_logger
+    from mme_vla.training.runs import claim_run
+    from mme_vla.training.settings import TrainSettings
+
+    settings = TrainSettings.from_dict(config["train"], config["seed"])
+    check_logger(config)
+    if settings.device == "cuda":
+        find_device("cuda")  # says so where there is none
+    # Where processes have all weights each, gradients lie in what is sent instead of being copied there.
+    one_copy = DistributedDataParallelKwargs(gradient_as_bucket_view=True)
+    accelerator = Accelerator(cpu=settings.device == "cpu", kwargs_handlers=[one_copy])
+    selection: list[Any] = [None]
+    with ExitStack() as resources:
+        if accelerator.is_main_process:  # the clock is in the folder's name: the first process decides
+            selection[0], lock = claim_run(folder, named, config["resume"], config)
+            resources.push(lock)
+        run = broadcast_object_list(selection)[0]
+        if run.folder != folder:
+            with suppress(OSError):
+                folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
+        trainer = _train(cfg, config, run, settings, accelerator, begun)
+    if trainer.stopped_by is not None:
+        raise SystemExit(128 + trainer.stopped_by)
+    assert trainer.last_checkpoint is not None
+    return trainer.last_checkpoint
+
+
+def _train(
+    cfg: DictConfig, config: dict[str, Any], run: "Run", settings: "TrainSettings", accelerator: Any, begun: float
+) -> "Trainer":
+    import torch
+    from accelerate.utils import broadcast_object_list
+
+    from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.capabilities import with_vision_memory
+    from mme_vla.policy.finetune import apply_finetuning, cast_frozen
+    from mme_vla.policy.tensor_files import take_memory
+    from mme_vla.training.checkpoint import check_disk, load_policy
+    from mme_vla.training.data import check_frozen, prepare_data
+    from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
+    from mme_vla.training.loop import Trainer, finish
+    from mme_vla.training.order import Validation
+    from mme_vla.training.runs import CONFIG, check_content, start_from, weights_to_start_from
+
+    first = accelerator.is_main_process
+    # Of processes that share the weights, one a machine holds them until they are shared: it may have to build a cache.
+    sharded = settings.parallel.shards(accelerator.device)
+    holds = accelerator.is_local_main_process or not sharded
+    line = ProgressLine(settings.steps, run.step, visible=first)
+    # A backbone whose weights are about to be replaced is not initialised first.
+    init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
+    with nullcontext() if holds else torch.device("meta"):
+        policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
+    check_frozen(policy, config["finetune"]["freeze_vision"])
+    if init_from is not None and holds:
+        line.say(start_from(policy, init_from))
+    with nullcontext() if holds else torch.device("meta"):
+        apply_finetuning(policy, **config["finetune"])
+    if run.checkpoint is not None:
+        if holds:
+            load_policy(run.checkpoint, policy)
+            cast_frozen(policy, config["finetune"].get("frozen_dtype"))
+        line.say(f"continuing from {run.checkpoint}")
+    recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
+    policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
+    if holds:
+        take_memory(policy.to(accelerator.device))
+    encoder = broadcast_object_list(
+        [with_vision_memory(policy).vision_fingerprint() if first and policy.memory else None]
+    )
+    local = config["data"]["cache"].get("local", False)
+    with accelerator.local_main_process_first() if local else accelerator.main_process_first():
+        of_run = (config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
+        data = prepare_data(policy, *of_run, encoder[0])
+    if run.checkpoint is not None:
+        check_content(run.checkpoint, data.content)
+    config["data"]["content"] = data.content
+    check_disk(run.folder, policy, settings.keep, sharded)
+    validation, collate = None, policy.require_processor().collate
+    if data.val is not None and settings.val_samples:
+        batch_size = settings.batch_size // (settings.accumulate * accelerator.num_processes)
+        validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)
+    trainer = Trainer(policy, data.train, collate, validation, settings, run, config, accelerator)
+    line.say(trainer.describe())
+    loggers = open_loggers(run.folder, config, run.step) if first else Loggers()
+    if first:
+        remove_drafts(run.folder)
+        with write_atomically(run.folder / CONFIG) as draft:
+            OmegaConf.save(cfg, draft, resolve=True)
+    try:
+        with line:
+            finished = trainer.run(line, loggers)
+            trainer.close()
+        if finished:
+            finish(trainer, data, time.perf_counter() - begun, line, loggers)
+    finally:
+        loggers.close()
+    accelerator.end_training()
+    return trainer
+
+
+def cache_command() -> str:
+    """The command that builds the vision cache of this run: the same words, but for those on resuming and output."""
+    from hydra.core.hydra_config import HydraConfig
+
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
+    words = [word for word in overrides if not word.startswith(("resume=", "output="))]
+    if "--config-dir" in sys.argv[:-1]:
+        words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
+    return shlex.join(["python", "-m", "mme_vla.data.cache", *words])

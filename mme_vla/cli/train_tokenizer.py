@@ -1,0 +1,63 @@
+"""Train the small tokenizer that the library ships: `mme-vla train-tokenizer [folder]`.
+
+Its corpus (`mme_vla/assets/tokenizer_corpus.txt`) is the language of RoboMME: the goals and subgoals of the 16 tasks
+with their colours, counts and ordinals, the prompts' own words, the numbers 0…255 and image points. The settings are
+those of PaliGemma's tokenizer wherever they touch behaviour: the same special ids, single digits, bytes for unknown
+characters, and text taken as it stands (no prefix, no case folding, spaces and newlines kept). Training is
+deterministic.
+"""
+
+import io
+import string
+import sys
+from collections.abc import Iterable, Sequence
+from importlib.resources import files
+from pathlib import Path
+
+from mme_vla.errors import UserError
+
+VOCAB_SIZE = 1024
+
+
+def train_tokenizer(sentences: Iterable[str], vocab_size: int = VOCAB_SIZE) -> bytes:
+    """Return a SentencePiece model of `vocab_size` pieces made from these sentences."""
+    from sentencepiece import SentencePieceTrainer
+
+    model = io.BytesIO()
+    try:
+        SentencePieceTrainer.train(
+            sentence_iterator=iter(sentences),
+            model_writer=model,
+            model_type="bpe",
+            vocab_size=vocab_size,
+            pad_id=0,
+            eos_id=1,
+            bos_id=2,
+            unk_id=3,
+            byte_fallback=True,
+            split_digits=True,
+            add_dummy_prefix=False,
+            remove_extra_whitespaces=False,
+            normalization_rule_name="identity",
+            user_defined_symbols=["\n"],
+            required_chars="".join(sorted(set(string.printable) - set(string.whitespace))),
+            character_coverage=1.0,
+            num_threads=1,
+            minloglevel=2,
+        )
+    except RuntimeError as error:
+        raise UserError(f"Could not train a tokenizer of {vocab_size} pieces: {error}.") from None
+    return model.getvalue()
+
+
+def read_corpus() -> list[str]:
+    """Return the sentences of the shipped corpus."""
+    return files("mme_vla").joinpath("assets/tokenizer_corpus.txt").read_text(encoding="utf-8").splitlines()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Train on the shipped corpus and write `tokenizer.model` into the folder named first, or the current one."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    path = Path(arguments[0] if arguments else ".") / "tokenizer.model"
+    path.write_bytes(train_tokenizer(read_corpus()))
+    print(f"Wrote {path} ({VOCAB_SIZE} pieces).")

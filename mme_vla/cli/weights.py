@@ -1,0 +1,199 @@
+"""`mme-vla weights SRC DST`: a checkpoint from one format to another.
+
+Words after the two places are overrides of configs/policy.yaml, as for every command; a checkpoint of ours brings its
+own configuration. The full backbone is assumed unless `backbone=…` says otherwise.
+"""
+
+import math
+import re
+import shutil
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from mme_vla.cli.help import argument_parser
+from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
+from mme_vla.errors import UserError
+from mme_vla.policy.base import Policy
+from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
+from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
+from mme_vla.weights.load import adapter_of, read_as
+from mme_vla.weights.source import FORMATS, Source, open_source
+from mme_vla.weights.statistics import read_stats
+from mme_vla.weights.tables import Adapter
+from mme_vla.weights.writers import check_target, write_policy
+
+
+def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
+    """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered layers are one row."""
+    console = console or Console(width=None if sys.stdout.isatty() else 200)
+    read, target_format = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
+    console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
+    sides = {fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"}
+    if not sides:
+        console.print("Both sides have the same names.")
+    for fmt, title in sides.items():
+        _print_adapter(console, adapter_of(fmt, policy), policy, title)
+
+
+def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: str) -> None:
+    state = policy.state_dict()
+    shapes = adapter.shapes(state)
+    table = _table(f"{title}: {len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours")
+    for column in ("theirs", "shape", "layout", "ours", "tensors"):
+        table.add_column(column, overflow="fold", justify="right" if column == "tensors" else "left")
+    rows: dict[tuple[str, ...], int] = {}
+    for target, pieces in adapter.table.items():
+        for piece in pieces:
+            # A pattern with the same two sides only says how many rows there are.
+            left, _, right = (side.strip() for side in piece.pattern.partition("->"))
+            layout = "" if left == right else piece.pattern
+            cells = (_starred(piece.path), _shape(shapes[piece.path]), layout, _starred(target))
+            rows[cells] = rows.get(cells, 0) + 1
+    for row, count in rows.items():
+        table.add_row(*row, str(count))
+    console.print(table)
+    gaps = [
+        (gap.path, "whole" if gap.layer is None else f"layer {gap.layer}", _shape(gap.shape), str(math.prod(gap.shape)))
+        for gap in adapter.unread
+    ]
+    about = "no action depends on them (dropped when read, zeros when written)"
+    _print_list(console, f"{title}, unread: {about}", gaps, ("tensor", "part", "shape", "parameters"))
+    _print_list(console, f"{title}, tied: copies", adapter.tied.items(), ("tensor", "is"))
+    derived = [(constant.path, _shape(tuple(constant.make().shape))) for constant in adapter.derived]
+    _print_list(console, f"{title}, derived: recomputed constants", derived, ("tensor", "shape"))
+
+
+def _print_list(console: Console, title: str, rows: Iterable[tuple[str, ...]], columns: tuple[str, ...]) -> None:
+    rows = list(rows)
+    if not rows:
+        console.print(f"{title}: none")
+        return
+    table = _table(title)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, title_justify="left", box=None, pad_edge=False)
+
+
+def _starred(name: str) -> str:
+    return re.sub(r"(?<=\.)\d+(?=\.)", "*", name)
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return "×".join(map(str, shape)) or "scalar"
+
+
+EXAMPLES = (
+    "lerobot/pi05_base base                         # to ours",
+    "runs/modul/79999 modul model=framesamp_modul   # a released JAX run",
+    "base for_lerobot --to lerobot",
+    "base - --to openpi --dry-run                   # the mapping alone",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line and convert; a mistake of the user's ends with a sentence and code 2."""
+    parser = argument_parser("mme-vla weights", __doc__, EXAMPLES)
+    parser.add_argument("source", help="folder, safetensors file, Orbax run or step, or owner/name on the hub")
+    parser.add_argument("destination", help="new folder; never one that exists ('-' with --dry-run)")
+    parser.add_argument("overrides", nargs="*", help="model=…, backbone=…, memory.budget=…")
+    parser.add_argument("--to", default="ours", choices=list(FORMATS), help="format to write (default: ours)")
+    parser.add_argument("--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in")
+    parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
+    parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
+    parser.add_argument("--base", help="what a run of OpenVLA-OFT was trained on, where it holds its adapters alone")
+    parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
+    parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
+    args = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
+    from mme_vla.cli.errors import print_user_errors
+
+    with print_user_errors():
+        convert(
+            args.source, args.destination, args.overrides, to=args.to, dtype=args.dtype, asset=args.asset,
+            revision=args.revision, base=args.base, dry_run=args.dry_run, trust_plugins=args.trust_plugins,
+        )  # fmt: skip
+
+
+def convert(
+    source: str | Path,
+    destination: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    to: str = "ours",
+    dtype: str = "float32",
+    asset: str | None = None,
+    revision: str | None = None,
+    base: str | Path | None = None,
+    dry_run: bool = False,
+    trust_plugins: bool = False,
+) -> None:
+    """Convert a checkpoint; the destination appears whole or not at all.
+
+    With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
+    """
+    target, kind = Path(destination).expanduser(), dtype_of(dtype)
+    if not dry_run and target.exists():
+        raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
+    opened = open_source(source, revision, base=base)
+    policy = _policy(opened, overrides, trust_plugins)
+    check_target(policy, to)
+    tensors = read_as(policy, opened)
+    if dry_run:
+        print_mapping(policy, opened, to)
+        return
+    if to == "ours" and policy.processor is None:
+        from mme_vla.policy.build import build_processor
+
+        policy.processor = build_processor(policy.config)
+    with torch.no_grad():
+        assign_tensors(policy, tensors, str(source), torch.float32)
+    stats = read_stats(opened.folder, asset)
+    if policy.processor is not None and stats is not None:
+        policy.processor.stats = stats
+    draft = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    try:
+        write_policy(policy, draft, to, kind, stats)
+        draft.rename(target)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Policy:
+    """The policy a source belongs to, on meta, with its processor if that can be had."""
+    from mme_vla.config.composition import compose
+    from mme_vla.processing.base import load_processor
+
+    if opened.format == "ours":
+        if overrides:
+            raise UserError(f"{opened.folder} brings its own configuration: {' '.join(overrides)} would contradict it.")
+        config = {key: value for key, value in opened.config.items() if key != "adapters"}
+        if "backbone" not in config:
+            raise UserError(f"{opened.folder} holds our weights but no config.json that describes them.")
+        import_trusted(config, str(opened.folder), trust_plugins)
+        policy: Policy = build_saved(policy_class(config), config, str(opened.folder / CONFIG))
+        policy.processor = load_processor(opened.folder)
+        check_processor(policy, str(opened.folder))
+        return policy
+    words, declared = list(overrides), opened.model
+    named = [word.partition("=")[2] for word in words if word.startswith("model=")]
+    if declared is not None and named and named[-1] != declared:
+        raise UserError(f"{opened.folder} says it is {declared}, but model={named[-1]} was given.")
+    if not named:
+        words.insert(0, f"model={declared or 'pi05'}")
+    if not any(word.startswith("backbone=") for word in words):
+        words.append(f"backbone={compose('policy', words).full_size}")
+    from mme_vla.policy.build import build_from_config
+
+    return build_from_config(compose("policy", words), device="meta")

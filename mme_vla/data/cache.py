@@ -1,0 +1,220 @@
+"""The vision cache: pooled tokens of the memory view, computed once with the frozen encoder and read memory-mapped.
+
+`mme-vla cache model=… data=…` builds it; under `torchrun` every process takes its share of the
+episodes. One folder holds the tokens of one dataset under one encoder and one way of pooling; what it was made of
+is in its `fingerprint.json`, and a folder whose fingerprint is not the expected one is refused, never read and
+never replaced unless asked to.
+"""
+
+import re
+from collections import OrderedDict
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.errors import UserError, brief
+from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
+from mme_vla.utils import Sums, decoding, files_to_hold, read_json, require_file, user_cache
+
+if TYPE_CHECKING:
+    pass
+
+FORMAT = 1  # of the files below
+PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
+FINGERPRINT = "fingerprint.json"
+COMMAND = "mme-vla cache model=<model> data=<data>"
+DTYPES = {"bfloat16": np.uint16, "float32": np.float32}  # bfloat16 is stored as its bits
+
+
+class CacheMissingError(UserError):
+    """There is no cache, or not all of it yet: building (on) mends it."""
+
+
+def default_cache_root() -> Path:
+    """Where caches go unless told otherwise: $MME_VLA_CACHE, else ~/.cache/mme_vla."""
+    return user_cache("vision")
+
+
+def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: str = "bfloat16") -> dict[str, Any]:
+    """Everything the tokens of a cache depend on.
+
+    Args:
+        source: the dataset. spec: what a memory stores of each frame.
+        encoder: hash of the vision tower's weights (`policy.vision_fingerprint()`).
+        dtype: `bfloat16` or `float32`.
+    """
+    if dtype not in DTYPES:
+        raise UserError(f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
+    return {
+        "format": FORMAT,
+        "encoder": encoder,
+        "preprocessing": PREPROCESSING,
+        "view": source.columns[source.robot.memory_camera],
+        "dtype": dtype,
+        "storage": spec.to_dict(),
+        "dataset": {"content": source.fingerprint, "episodes": len(source), "frames": int(source.lengths.sum())},
+    }
+
+
+def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) -> Path:
+    """The folder of a cache below `root`: readable, and another one for another dataset, encoder, pooling or camera."""
+    spec = StorageSpec(**expected["storage"])
+    scorer = f"-{spec.scorer}" if spec.scorer else ""
+    encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
+    # RoboMME's memory camera goes without saying, as in caches that were built before there were others.
+    view = "" if expected["view"] == ROBOMME_JOINT.cameras[0].key else re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
+    name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
+    return root / f"{source.name}-{source.fingerprint[:8]}" / name
+
+
+def stored_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
+    """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were drawn."""
+    stored = spec.stored_frames(int(source.lengths[episode]))
+    return stored[source.rendered(episode)[stored]]
+
+
+def token_file(folder: Path, episode: int) -> Path:
+    """Tokens of an episode, [kept frames, patches, d]."""
+    return folder / f"episode_{episode:06d}.npy"
+
+
+def score_file(folder: Path, episode: int) -> Path:
+    """Scores of an episode, where the memory needs them; written before the tokens, so that tokens imply scores."""
+    return folder / f"episode_{episode:06d}.scores.npz"
+
+
+def sum_file(folder: Path, episode: int) -> Path:
+    """SHA-256 sums of an episode's files; written before the tokens, too. Caches of older versions have none."""
+    return folder / f"episode_{episode:06d}.sha256"
+
+
+class VisionCache:
+    """A finished cache of one dataset: histories of its episodes, of which only the rows asked for are read.
+
+    An episode's files are compared with their checksums when its history is first asked for, once a process.
+    """
+
+    max_open: int
+    """Histories kept at hand: of all episodes, as far as the process may hold their files."""
+
+    def __init__(self, folder: Path, source: EpisodeSource, expected: dict[str, Any], command: str = COMMAND) -> None:
+        """Open and check a cache.
+
+        Args:
+            folder: where it is (`cache_folder`). source: the dataset it belongs to.
+            expected: the fingerprint it must have. command: what to tell the user to run, without `rebuild=true`.
+
+        Raises:
+            CacheMissingError: it does not exist or is half-written.
+            UserError: it was made of something else, or a file is damaged. Both name the command that mends it.
+        """
+        check_fingerprint(folder, expected, command)
+        self.folder, self.spec = folder, StorageSpec(**expected["storage"])
+        self._source, self._lengths, self._exec_starts = source, source.lengths, source.exec_starts
+        self._dtype, self._command = DTYPES[expected["dtype"]], command
+        files = (token_file, score_file) if self.spec.scorer else (token_file,)
+        missing = [e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)]
+        if missing:
+            raise CacheMissingError(
+                f"The vision cache {folder} is half-written: {len(missing)} of {len(source)} episodes are missing. "
+                f"Finish it with: {command}"
+            )
+        widths = {self._tokens(episode).shape[-1] for episode in range(len(source))}
+        if len(widths) > 1:
+            raise UserError(f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true")
+        self.width = widths.pop()
+        self.max_open = files_to_hold(len(source))
+        self._histories: OrderedDict[int, CachedHistory] = OrderedDict()
+        self._verified: set[int] = set()
+
+    def history(self, episode: int) -> CachedHistory:
+        """The stored tokens of a whole episode."""
+        if episode not in self._histories:
+            self.verify(episode)
+            length = int(self._lengths[episode])
+            self._histories[episode] = CachedHistory(
+                self.spec,
+                self._tokens(episode),
+                stored_frames(self._source, episode, self.spec),
+                length,
+                self._scores(episode),
+                int(self._exec_starts[episode]),
+            )
+            while len(self._histories) > self.max_open:
+                self._histories.popitem(last=False)
+        self._histories.move_to_end(episode)
+        return self._histories[episode]
+
+    def verify(self, episode: int) -> None:
+        """Compare an episode's files with the checksums that were written with them, the first time it is asked for."""
+        if episode in self._verified:
+            return
+        sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)
+        for name in sums.table:
+            sums.check(name)
+        self._verified.add(episode)
+
+    @property
+    def _remedy(self) -> str:
+        return f"Rebuild the cache: {self._command} rebuild=true"
+
+    def _tokens(self, episode: int) -> np.ndarray:
+        path = token_file(self.folder, episode)
+        rows = len(stored_frames(self._source, episode, self.spec))
+        with decoding(require_file(path), "tokens of a vision cache", self._remedy):
+            tokens = np.lib.format.open_memmap(path, mode="r")
+        if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:
+            raise UserError(
+                f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
+                f"{self.spec.grid**2}, d] is expected. {self._remedy}"
+            )
+        return tokens
+
+    def _scores(self, episode: int) -> FrameScores | None:
+        if not self.spec.scorer:
+            return None
+        path = score_file(self.folder, episode)
+        with decoding(require_file(path), "scores of a vision cache", self._remedy), np.load(path) as stored:
+            frames, values = stored["frames"], stored["values"]
+        length, patches = int(self._lengths[episode]), self.spec.grid**2
+        if (
+            (frames.dtype, values.dtype) != (np.int64, np.float32)
+            or frames.ndim != 1
+            or values.shape != (len(frames), patches)
+            or (frames < 0).any()
+            or (frames >= length).any()
+            or not np.isfinite(values).all()
+        ):
+            raise UserError(
+                f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames "
+                f"{list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below {length} are "
+                f"expected. {self._remedy}"
+            )
+        return FrameScores(frames, values)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_histories": OrderedDict()}  # a worker maps its own
+
+
+def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COMMAND) -> None:
+    """Make sure that `folder` was made of what is expected.
+
+    Raises:
+        CacheMissingError: there is nothing. UserError: it is something else; the message says what differs.
+    """
+    path = folder / FINGERPRINT
+    if not path.is_file():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another data.cache.root.")
+        raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
+    recorded = read_json(path, "what a vision cache was made of")
+    differing = [key for key, value in expected.items() if recorded.get(key) != value]
+    if differing:
+        details = "; ".join(
+            f"{key} is {brief(recorded.get(key), 200)}, expected {expected[key]!r}" for key in differing
+        )
+        raise UserError(f"The vision cache {folder} is stale: {details}. Rebuild it with: {command} rebuild=true")

@@ -1,0 +1,323 @@
+"""Building a vision cache: episode by episode, each written whole or not at all."""
+
+import logging
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import groupby
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.data.cache import (
+    COMMAND,
+    DTYPES,
+    FINGERPRINT,
+    CacheMissingError,
+    VisionCache,
+    cache_folder,
+    check_fingerprint,
+    default_cache_root,
+    fingerprint,
+    score_file,
+    stored_frames,
+    sum_file,
+    token_file,
+)
+from mme_vla.data.console import progress
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.memory.base import Memory, frames_scored, make_scorer
+from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
+
+PAGE = 4096  # bytes
+CHUNKS_AHEAD = 2
+
+Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What building would take: frames to encode, bytes on disk, seconds (one process), as measured on a few frames."""
+
+    frames: int
+    bytes: int
+    seconds: float
+
+
+def process_rank() -> tuple[int, int]:
+    """(rank, world size) as torchrun gives them, (0, 1) without it."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def clear_cache(folder: Path) -> None:
+    """Remove the files of a cache, and nothing else."""
+    if not folder.exists():
+        return
+    if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
+        raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.")
+    for pattern in ("episode_*.np[yz]", "episode_*.sha256", "*.partial", FINGERPRINT):
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
+
+
+def build_cache(
+    source: EpisodeSource,
+    memory: Memory,
+    encode: Encode,
+    folder: Path,
+    expected: dict[str, Any],
+    *,
+    batch_size: int = 32,
+    shard: tuple[int, int] | None = None,
+) -> int:
+    """Encode the episodes that are still missing; return how many were written.
+
+    Stopped at any moment, it continues with the next call. Processes share the work: of the episodes, each takes those
+    whose number is its rank modulo the world size.
+    """
+    rank, world = process_rank() if shard is None else shard
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / FINGERPRINT).is_file():
+        if any(not path.name.endswith(".partial") for path in folder.iterdir()):
+            check_fingerprint(folder, expected)
+        write_json(folder / FINGERPRINT, expected, indent=1)
+    check_fingerprint(folder, expected)
+    remove_drafts(folder)
+    mine = range(rank, len(source), world)
+    missing = [episode for episode in mine if not token_file(folder, episode).is_file()]
+    total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
+    with (
+        progress(f"vision cache {source.name}", total, total - left, "frames") as advance,
+        # Images are decoded in a thread while the ones before them are encoded.
+        closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
+    ):
+        for episode, of_episode in groupby(chunks, lambda chunk: chunk[0]):
+            some = (chunk for _, chunk in of_episode)
+            _build_episode(source, episode, some, memory, encode, folder, expected["dtype"], advance)
+    return len(missing)
+
+
+def _of_all(
+    source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
+) -> Iterator[tuple[int, "_Chunk"]]:
+    """The chunks of all episodes, one after the other; an episode of which nothing was drawn has an empty one."""
+    for episode in episodes:
+        yield episode, _Chunk(0, np.zeros((0, 1, 1, 3), np.uint8), [], [])
+        for chunk in _chunks(source, episode, memory, batch_size):
+            yield episode, chunk
+
+
+def estimate(
+    source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
+) -> Estimate:
+    """Measure a few batches of the first episode and extrapolate to the dataset."""
+    n_stored = sum(len(stored_frames(source, episode, memory.storage)) for episode in range(len(source)))
+    chunk = next(_chunks(source, 0, memory, batch_size))
+    encode(chunk.stored_images[:1])  # the first call pays for warming up
+    started = time.perf_counter()
+    n_frames, bytes_per_frame = 0, 0
+    for chunk in _chunks(source, 0, memory, batch_size):
+        tokens = encode(chunk.stored_images)
+        bytes_per_frame = tokens[0].numel() * np.dtype(DTYPES[dtype]).itemsize
+        n_frames += chunk.length
+        if time.perf_counter() - started > 5:
+            break
+    seconds = (time.perf_counter() - started) / n_frames * int(source.lengths.sum())
+    return Estimate(n_stored, n_stored * bytes_per_frame, seconds)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A stretch of an episode: how many frames it spans, the images to encode, and the scores that came up."""
+
+    length: int
+    stored_images: np.ndarray
+    score_frames: list[int]
+    score_values: list[np.ndarray]
+
+
+def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
+    spec, length, scorer = memory.storage, int(source.lengths[episode]), make_scorer(memory)
+    stored, scored = stored_frames(source, episode, memory.storage), frames_scored(memory, length)
+    span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
+    for start in range(0, length, span):
+        stop = min(start + span, length)
+        here = stored[(stored >= start) & (stored < stop)]
+        required = np.union1d(here, scored[(scored >= start) & (scored < stop)])
+        if not len(required):
+            continue
+        images = source.frames(episode, required)
+        frames, values = [], []
+        if scorer is not None:
+            for frame, image in zip(required.tolist(), images, strict=True):
+                row = scorer(frame, image)
+                if row is not None:
+                    frames.append(frame)
+                    values.append(np.asarray(row, np.float32))
+        yield _Chunk(stop - start, images[np.isin(required, here)], frames, values)
+
+
+def _build_episode(
+    source: EpisodeSource,
+    episode: int,
+    chunks: Iterable[_Chunk],
+    memory: Memory,
+    encode: Encode,
+    folder: Path,
+    dtype: str,
+    advance: Callable[[int], None],
+) -> None:
+    patches = memory.storage.grid**2
+    rows: list[np.ndarray] = []
+    frames: list[int] = []
+    values: list[np.ndarray] = []
+    for chunk in chunks:
+        frames += chunk.score_frames
+        values += chunk.score_values
+        if len(chunk.stored_images):
+            tokens = encode(chunk.stored_images)
+            if tokens.shape[:2] != (len(chunk.stored_images), patches):
+                raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames")
+            rows.append(_to_numpy(tokens, dtype))
+        advance(chunk.length)
+    if not rows:
+        raise UserError(f"{source.name}, episode {episode}: none of the frames that the memory stores was drawn.")
+    drafts: dict[Path, Path] = {}
+    if memory.storage.scorer:
+        stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
+        path = score_file(folder, episode)
+        drafts[path] = _draft(path, np.savez, frames=np.asarray(frames, np.int64), values=stacked)
+    path = token_file(folder, episode)
+    drafts[path] = _draft(path, save_aligned, np.concatenate(rows))
+    sums = "".join(sum_line(draft, path.name) for path, draft in drafts.items())
+    with write_atomically(sum_file(folder, episode)) as draft:
+        draft.write_text(sums)
+    for path, draft in drafts.items():  # tokens last: where they are, all else is
+        draft.replace(path)
+
+
+def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
+    """Write an array as .npy whose numbers begin at a page: a row of one page is then read as one, not as two."""
+    buffer = BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
+    magic, described = buffer.getvalue()[:8], buffer.getvalue()[10:].rstrip()
+    described += b" " * (PAGE - 11 - len(described)) + b"\n"
+    file.write(magic + len(described).to_bytes(2, "little") + described)
+    file.write(np.ascontiguousarray(array).data)
+
+
+def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
+    if dtype == "bfloat16":
+        return tokens.detach().to(torch.bfloat16).view(torch.uint16).cpu().numpy()
+    return tokens.detach().float().cpu().numpy()
+
+
+def _draft(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> Path:
+    """What will become `path`, on disk already."""
+    draft = draft_of(path)
+    with draft.open("wb") as handle:
+        writer(handle, *arrays, **named)
+        handle.flush()
+        os.fsync(handle.fileno())
+    return draft
+
+
+log = logging.getLogger(__name__)
+
+
+def ensure_cache(
+    source: EpisodeSource,
+    memory: Memory,
+    encode: Encode,
+    encoder: str,
+    *,
+    root: Path | str | None = None,
+    dtype: str = "bfloat16",
+    max_build_frames: int = 5000,
+    batch_size: int = 32,
+    command: str = COMMAND,
+) -> VisionCache:
+    """Open the cache of a dataset for this memory; build it first, or finish it, where the dataset is small.
+
+    Args:
+        source, memory: whose tokens. encode: `policy.encode_frames`. encoder: `policy.vision_fingerprint()`.
+        root: folder of all caches; None for `default_cache_root()`.
+        dtype: of the stored tokens. batch_size: frames encoded at once.
+        max_build_frames: datasets of more frames are not built here: that is worth a command of its own.
+        command: that command, for messages.
+    """
+    coded = source.lossy.get(source.robot.memory_camera)
+    if coded is not None and make_scorer(memory) is not None:
+        log.warning(
+            "%s: its videos are coded as %s, and this memory scores patches by how little they change: what "
+            "compression changes passes for motion. Convert the recordings with lossless videos, or choose another "
+            "memory.",
+            source.name, coded,
+        )  # fmt: skip
+    expected = fingerprint(source, memory.storage, encoder, dtype)
+    folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
+    try:
+        return VisionCache(folder, source, expected, command)
+    except CacheMissingError as error:
+        frames = int(source.lengths.sum())
+        if frames > max_build_frames:
+            raise UserError(
+                f"{error} (It is not built here because {source.name} has {frames} frames, more than "
+                f"data.cache.max_build_frames={max_build_frames}; add dry_run=true to see size and time first.)"
+            ) from None
+    # All of it here, also under torchrun, where training has its first process prepare the data for the others.
+    build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
+    return VisionCache(folder, source, expected, command)
+
+
+_END = object()
+
+
+def ahead[T](things: Iterable[T], count: int) -> Generator[T, None, None]:
+    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where they are used.
+
+    Closing the generator ends the thread.
+    """
+    made: queue.Queue[Any] = queue.Queue(count)
+    closed = threading.Event()
+
+    def put(thing: Any) -> bool:
+        while not closed.is_set():
+            try:
+                made.put(thing, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def make() -> None:
+        try:
+            for thing in things:
+                if not put((thing, None)):
+                    return
+            put((_END, None))
+        except BaseException as error:
+            put((_END, error))
+
+    thread = threading.Thread(target=make, name="ahead", daemon=True)
+    thread.start()
+    try:
+        while True:
+            thing, error = made.get()
+            if error is not None:
+                raise error
+            if thing is _END:
+                return
+            yield thing
+    finally:
+        closed.set()
+        thread.join()

@@ -1,0 +1,86 @@
+"""The progress of this room's long commands: a bar on a terminal, a line now and then anywhere else."""
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partialmethod
+
+
+@contextmanager
+def quiet_libraries() -> Iterator[None]:
+    """Surround work whose progress this library shows itself.
+
+    Notes go that are no warnings; bars of tqdm are drawn on terminals alone, those of `datasets` not at all.
+    """
+    import av.logging
+    import tqdm
+    from lerobot.utils.utils import SuppressProgressBars
+
+    root = logging.getLogger()  # LeRobot reports by it
+    level, begin = root.level, tqdm.tqdm.__init__
+    root.setLevel(max(level, logging.WARNING))
+    tqdm.tqdm.__init__ = partialmethod(begin, disable=None)
+    # x264 sums up every video that it closes. LeRobot asks for warnings only, but not until then.
+    av.logging.set_libav_level(av.logging.ERROR)
+    try:
+        with SuppressProgressBars():
+            yield
+    finally:
+        av.logging.set_libav_level(av.logging.INFO)  # FFmpeg's own default
+        tqdm.tqdm.__init__ = begin
+        root.setLevel(level)
+
+
+LINE_SECONDS = 20.0
+"""Without a terminal: how long a log stays silent at most while steps are being finished."""
+
+
+@contextmanager
+def progress(description: str, total: int, done: int = 0, unit: str = "") -> Iterator[Callable[[int], None]]:
+    """Show a bar of `total` steps, `done` of them finished before; the yielded function advances it.
+
+    Where no terminal is, a line says what is finished: at most one every `LINE_SECONDS`, and one after the last step.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    if not console.is_terminal:
+        yield _Lines(console.print, description, total, done, unit).advance
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
+        task = bar.add_task(description, total=total, completed=done)
+
+        def advance(steps: int) -> None:
+            bar.advance(task, steps)
+
+        yield advance
+
+
+class _Lines:
+    def __init__(self, say: Callable[[str], None], description: str, total: int, done: int, unit: str) -> None:
+        self._say, self._description, self._total, self._unit = say, description, total, unit
+        self._before = self._done = done
+        self._begun = self._reported = time.monotonic()
+
+    def advance(self, steps: int) -> None:
+        """Count; say so if it is time."""
+        self._done += steps
+        now = time.monotonic()
+        if self._done < self._total and now - self._reported < LINE_SECONDS:
+            return
+        self._reported = now
+        each = (now - self._begun) / max(self._done - self._before, 1)
+        remaining = (
+            f", about {_duration_text(each * (self._total - self._done))} left" if self._done < self._total else ""
+        )
+        count = f"{self._done:,} of {self._total:,} {self._unit}".rstrip()
+        self._say(f"{self._description}: {count} in {_duration_text(now - self._begun)}{remaining}")
+
+
+def _duration_text(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

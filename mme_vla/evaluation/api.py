@@ -1,0 +1,106 @@
+"""`evaluate` from Python: a policy on the benchmark in one call, with what the command would set."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from mme_vla.data.sources import open_sources
+from mme_vla.envs.make import make_env, require_simulator
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.feed import with_sessions
+from mme_vla.evaluation.recordings import all_recordings
+from mme_vla.evaluation.rollout.evaluation import (
+    Evaluation,
+    checkpoint_label,
+    choose_episodes,
+    default_output,
+    memory_budget,
+)
+from mme_vla.evaluation.rollout.evaluation import evaluate as evaluate_run
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.base import Policy
+from mme_vla.subgoal import SubgoalPredictor, build_predictor
+
+
+def evaluate(
+    policy: Policy | str | Path,
+    tasks: str | Sequence[str] = "all",
+    episodes: int | Sequence[int] | None = None,
+    *,
+    seed: int = 42,
+    output: str | Path | None = None,
+    subgoal: str | SubgoalPredictor | None = None,
+    name: str | None = None,
+    base: Callable[..., Any] = make_env,
+    show_progress: bool = True,
+    recordings: Any = None,
+    **settings: Any,
+) -> Evaluation:
+    """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
+
+    Workers are processes that import the calling script: keep its work under `if __name__ == "__main__":`. A notebook
+    needs nothing of the kind.
+
+    Args:
+        policy: one with statistics; or what to load one from: a folder, a hub repository, or the shipped `nano`.
+        tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all of the split, a
+            number for the first so many, or a list.
+        seed: of the policy's noise.
+        output: the run's folder, by default the one the command would choose.
+        subgoal: a predictor, or the name of one, for policies that read subgoals.
+        name: what records call the policy; its own name by default.
+        base: makes an environment with the benchmark's interface, importable by name.
+        recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
+        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=4` or
+        `render=False`.
+
+    Returns:
+        The records of these episodes, and `success_rate`.
+
+    Raises:
+        UserError: a task, episode or setting that does not exist, a policy that cannot act, or a folder that holds
+            another run.
+
+    >>> evaluate("outputs/framesamp_modul/latest", "StopCube", 5, seed=7).success_rate  # doctest: +SKIP
+    0.4
+    """
+    known = [field.name for field in fields(RolloutSettings) if field.name != "seed"]
+    if unknown := [key for key in settings if key not in known]:
+        raise UserError(f"evaluate() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
+    run_settings = RolloutSettings(seed=seed, **settings)
+    jobs = choose_episodes(tasks, episodes, run_settings.split)
+    if base is make_env and run_settings.env == "mme_vla":
+        require_simulator()
+    loaded, source = load(policy)
+    predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
+    subgoal_label = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
+    facts = RunFacts(
+        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, run_settings.split,
+        run_settings.max_steps, subgoal_label, memory_budget(loaded),
+    )  # fmt: skip
+    folder = default_output(facts) if output is None else Path(output).expanduser()
+    donor_episodes = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
+    return evaluate_run(
+        wrapped,
+        jobs,
+        folder,
+        facts,
+        run_settings,
+        subgoals=predictor,
+        source=source,
+        base=base,
+        show_progress=show_progress,
+    )
+
+
+def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
+    """A policy, and where its weights are from; one that is given keeps to itself."""
+    if isinstance(policy, Policy):
+        return policy, None
+    from mme_vla.policy.run_folders import locate_checkpoint
+
+    source = locate_checkpoint(policy)
+    return Policy.from_pretrained(source), source

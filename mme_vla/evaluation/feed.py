@@ -1,0 +1,251 @@
+"""Frames on their way from an environment to a policy: other episodes first, no video, or a frame that is repeated."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.envs.metadata import SESSIONS, read_variant
+from mme_vla.errors import UserError
+from mme_vla.evaluation.recordings import Recording, stored_frames
+from mme_vla.memory.base import MemoryModule
+from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, frames_read, with_vision_memory
+from mme_vla.policy.episode import Episode, Host
+from mme_vla.types import Noise
+
+
+@dataclass(frozen=True)
+class Feed:
+    """Changes which frames of an episode a policy observes. The default changes nothing.
+
+    sessions: unrelated episodes that come first, as part of the conditioning video. video: whether the conditioning
+    video is shown. stills: how often one frame is repeated; at: which, counted from the first execution frame.
+    """
+
+    sessions: int = 0
+    video: bool = True
+    stills: int = 0
+    at: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("sessions", "stills", "at"):
+            if getattr(self, name) < 0:
+                raise UserError(f"A probe cannot show {getattr(self, name)} {name}: the number must not be negative.")
+
+    def repeats(self, frames: np.ndarray, exec_start: int) -> np.ndarray:
+        """How often each of the episode's frames [n] is observed, int64 [n]."""
+        shown = np.where((frames < exec_start) & (not self.video), 0, 1)
+        return shown + self.stills * (frames == exec_start + self.at)
+
+    def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
+        """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is left out.
+
+        Args:
+            exec_start: the episode's first execution frame. before: frames of the sessions.
+        """
+        frames = np.asarray(frames, np.int64)
+        video = exec_start if self.video else 0
+        later = np.where(frames >= exec_start + self.at, self.stills, 0)  # of a repeated frame: its last repeat
+        executed = before + video + frames - exec_start + later
+        return np.where(frames >= exec_start, executed, before + frames if self.video else -1)
+
+    def first_executed(self, exec_start: int, before: int = 0) -> int:
+        """The number of the first execution frame among the observed ones."""
+        return before + (exec_start if self.video else 0)
+
+    def source_frames(self, displayed: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
+        """The episode's frames behind observed ones [m], ascending, each once; those of sessions are left out."""
+        displayed = np.asarray(displayed, np.int64) - before
+        displayed = displayed[displayed >= 0]
+        video = exec_start if self.video else 0
+        past = displayed - video
+        executed = np.where(past > self.at, np.maximum(past - self.stills, self.at), past)
+        return np.unique(np.where(displayed < video, displayed, exec_start + executed))
+
+
+class FeedHost(Host, Protocol):
+    """What a fed episode needs of the policy that began it."""
+
+    inner: Policy
+    feed: Feed
+    sessions: list[Recording]
+
+    @property
+    def before(self) -> int: ...
+
+
+class FedEpisode(Episode):
+    """Passes frames on to `inner`, the policy's own episode, through a feed.
+
+    exec_start: the first execution frame, once it is observed. boundaries: observed frames at which sub-tasks began,
+    where the environment reports them.
+    """
+
+    def __init__(self, host: FeedHost, goal: str, seed: int = 0) -> None:
+        super().__init__(host, goal, seed)
+        self._host, self.seed = host, seed
+        self.inner = host.inner.start_episode(goal, seed)
+        self.exec_start: int | None = None
+        self.boundaries: Sequence[int] = ()
+
+    def observe(
+        self,
+        frames: Mapping[str, np.ndarray],
+        states: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+        rendered: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Take frames as `Episode.observe` does."""
+        self.inner.goal, self.inner.options = self.goal, self.options
+        states, numbers = np.asarray(states), self.n_observed_frames + np.arange(len(states))
+        demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
+        video = int(demo.sum())
+        if not self.n_observed_frames:
+            self._observe_sessions()
+        if self.exec_start is None and video < len(states):
+            self.exec_start = self.n_observed_frames + video
+        self.n_observed_frames += len(states)
+        repeats = self._host.feed.repeats(
+            numbers, self.n_observed_frames if self.exec_start is None else self.exec_start
+        )
+        order = np.repeat(np.arange(len(states)), repeats)
+        executed = order[order >= video]
+        if actions is not None:
+            per_frame = self._robot.action.frames is not None
+            actions = np.asarray(actions)[executed - video] if per_frame else actions if len(executed) else None
+        views, places = {}, {}
+        for name, view in frames.items():
+            at = np.arange(len(states)) if rendered is None or name not in rendered else np.asarray(rendered[name])
+            places[name] = np.flatnonzero(np.isin(order, at))
+            views[name] = view if (repeats == 1).all() else view[np.searchsorted(at, order[places[name]])]
+        shown = {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
+        self.inner.observe(views, states[order], demo[order], actions, **shown)
+
+    def _observe_sessions(self) -> None:
+        stored, before = stored_frames(self._host.inner, self._host.before), 0
+        for recording in self._host.sessions:
+            here = None if stored is None else stored[stored >= before] - before
+            recording.show(self.inner, 0, recording.length, here, video=True)
+            before += recording.length
+
+    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+        """Note where sub-tasks began, the execution among them, as numbers of observed frames."""
+        starts = np.array(sorted({0, exec_start, *frames}), np.int64)
+        displayed = self._host.feed.displayed(starts, exec_start, self._host.before)
+        self.boundaries = [int(frame) for frame in displayed if frame >= 0]
+
+    @property
+    def state(self) -> Tensor:
+        return self.inner.state
+
+    def acted(self, chunk: np.ndarray) -> None:
+        self.inner.acted(chunk)
+
+    def add_frames(self, *_: Any, **__: Any) -> None:
+        """Not offered: a feed decides on whole observations."""
+        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
+
+    set_view = add_frames
+
+
+class FedPolicy(Policy):
+    """`inner` with a feed before it. It evaluates and rolls out as any policy does, with the same noise."""
+
+    n_distractor_episodes: int = 0
+    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not count."""
+
+    def __init__(self, inner: Policy, feed: Feed, sessions: Sequence[Recording] = ()) -> None:
+        """Wrap a policy.
+
+        Args:
+            sessions: recorded episodes; the first `feed.sessions` of them are observed before each episode.
+        """
+        super().__init__()
+        self.inner, self.feed, self.sessions = inner, feed, list(sessions)[: feed.sessions]
+        self.memory, self.processor, self.config = inner.memory, inner.processor, dict(inner.config)
+        self.horizon, self.action_dim = inner.horizon, inner.action_dim
+        self.sample_steps = inner.sample_steps if isinstance(inner, SamplesInSteps) else 1
+        self.max_actions = inner.max_actions if isinstance(inner, LimitsActions) else None
+
+    @property
+    def before(self) -> int:
+        """Frames of the sessions."""
+        return sum(recording.length for recording in self.sessions)
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        return FedEpisode(self, goal, seed)
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        return self.inner.sampling_noise(generator)
+
+    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
+        return self.inner.sample_actions(batch, draws, steps)
+
+    @property
+    def history_dtype(self) -> torch.dtype:
+        return with_vision_memory(self.inner).history_dtype
+
+    def require_memory(self) -> MemoryModule:
+        return with_vision_memory(self.inner).require_memory()
+
+    def vision_fingerprint(self) -> str:
+        return with_vision_memory(self.inner).vision_fingerprint()
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor:
+        return with_vision_memory(self.inner).encode_frames(frames)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """The episode's frames that the policy reads through the feed."""
+        displayed = self.feed.displayed(steps, exec_start, self.before)
+        reads = frames_read(self.inner, displayed, self.feed.first_executed(exec_start, self.before))
+        if reads is None:
+            return None
+        paused = [exec_start + self.feed.at] if self.feed.stills else []
+        return np.union1d(self.feed.source_frames(reads, exec_start, self.before), np.array(paused, np.int64))
+
+    def observation(self, episodes: Sequence[Episode]) -> Any:
+        inner = [inner_episode(episode) for episode in episodes]
+        for episode, own in zip(episodes, inner, strict=True):
+            own.subgoal = episode.subgoal
+        return self.inner.observation(inner)
+
+    def predict_chunk(
+        self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        return self.inner.predict_chunk(batch, [inner_episode(episode) for episode in episodes], draws, steps)
+
+
+def inner_episode(episode: Episode) -> Episode:
+    """The policy's own episode behind a fed one."""
+    assert isinstance(episode, FedEpisode)
+    return episode.inner
+
+
+def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -> Policy:
+    """The policy as a split evaluates it: a split with sessions has it observe them before each episode.
+
+    They are the first of the recordings, the same before every episode, and count as part of its video.
+    """
+    variant = read_variant(split)
+    if variant is None or variant.dial != SESSIONS:
+        if recordings:
+            raise UserError(f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
+        return policy
+    count = variant.sessions
+    if not count:
+        return policy
+    if policy.embodiment.readings or not recordings:
+        raise UserError(f"split={split} needs recorded episodes to take from: name them with recordings=….")
+    if count > len(recordings):
+        raise UserError(f"split={split} needs {count} recorded episodes to take from, and there are {len(recordings)}.")
+    fed = FedPolicy(policy, Feed(sessions=count), recordings).eval()
+    fed.n_distractor_episodes = count
+    # The names are those of the probe's arm, so that runs of earlier versions continue.
+    fed.config["probe"] = [f"distract:{count}", [{"intervention": "Distract", "sessions": count}]]
+    fed.config["sessions"] = [recording.name for recording in fed.sessions]
+    return fed

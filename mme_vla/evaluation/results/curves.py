@@ -1,0 +1,137 @@
+"""A curve instead of a point: success over how far a dial of `split=stress:…` is turned; the test split is its zero."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mme_vla.envs.metadata import BASE, read_variant
+from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeRecord, merge
+from mme_vla.evaluation.results.aggregate import Interval, Method, Results, wilson
+from mme_vla.evaluation.results.plots import COLOURS, figure, svg
+from mme_vla.evaluation.results.tables import Table
+
+
+@dataclass(frozen=True)
+class Point:
+    """Success of a model on a task at one place of a dial. interval: Wilson's, over distinct episodes; in percent."""
+
+    turned: int
+    won: int
+    episodes: int
+    interval: Interval
+
+    @property
+    def rate(self) -> float:
+        """In percent."""
+        return 100 * self.won / self.episodes
+
+
+Curves = dict[tuple[str, str, str], list[Point]]
+"""(model, task, dial) → points, ascending."""
+
+
+def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
+    """Success over every dial that records were made with; records of the test split are at its zero.
+
+    A point counts the episodes that the model has at every place of the dial, so that one curve is of the same scenes.
+    """
+    groups: dict[tuple[str, str, str], dict[int, list[EpisodeRecord]]] = {}
+    merged = merge(records, conflicts)
+    for record in merged:
+        variant = read_variant(record.split)
+        if variant is not None and variant.dial:
+            at = (str(record.run._replace(split=BASE)), record.task, variant.dial)
+            groups.setdefault(at, {}).setdefault(variant.turned, []).append(record)
+    if not groups:
+        raise UserError("None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
+    curves: Curves = {}
+    for (run, task, dial), places in groups.items():
+        baseline = [r for r in merged if r.split == BASE and r.task == task and str(r.run) == run]
+        if baseline and 0 not in places:
+            places[0] = baseline
+        common = set.intersection(*({r.episode for r in there} for there in places.values()))
+        curves[run, task, dial] = [
+            _point(turned, [r for r in there if r.episode in common], confidence)
+            for turned, there in sorted(places.items())
+            if common
+        ]
+    return {name: points for name, points in curves.items() if points}
+
+
+def _point(turned: int, records: Sequence[EpisodeRecord], confidence: float) -> Point:
+    won = sum(record.success for record in records)
+    low, high = wilson(won / len(records), len(records), confidence)
+    return Point(turned, won, len(records), Interval(100 * low, 100 * high))
+
+
+def stress_table(curves: Curves) -> Table:
+    """Every point, a row each."""
+    rows = []
+    for (run, task, dial), points in sorted(curves.items()):
+        for p in points:
+            interval = f"[{p.interval.low:.1f}, {p.interval.high:.1f}]"
+            rows.append([run, task, dial, str(p.turned), str(p.episodes), f"{p.rate:.1f}", interval])
+    return Table("Success over the dials", ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
+
+
+def stress_figures(curves: Curves) -> dict[str, str]:
+    """For each task and dial a curve of every run, as SVG."""
+    figures = {}
+    for task, dial in dict.fromkeys((task, dial) for _, task, dial in sorted(curves)):
+        mine = {run: points for (run, its, of), points in curves.items() if (its, of) == (task, dial)}
+        with figure((5.6, 3.2)) as (canvas, (axes,)):
+            for i, (run, points) in enumerate(mine.items()):
+                rates = [p.rate for p in points]
+                below = [max(p.rate - p.interval.low, 0) for p in points]
+                above = [max(p.interval.high - p.rate, 0) for p in points]
+                axes.errorbar([p.turned for p in points], rates, [below, above], fmt="-o", ms=5, capsize=3,
+                              color=COLOURS[i % len(COLOURS)], label=run)  # fmt: skip
+            axes.set_xlabel(f"{dial}: more than in the benchmark")
+            axes.set_ylabel("success (%)")
+            axes.set_ylim(0, 100)
+            axes.legend(fontsize=8)
+            figures[f"{task}, {dial}"] = svg(canvas)
+    return figures
+
+
+EXTRA = "process"
+"""Where a record keeps it."""
+CAPTION = (
+    "Progress: sub-tasks done, of those there are. Then how many episodes ended by a wrong choice that is a mistake of "
+    "memory (which one, where, how many, in what order, how), by another wrong one, or with the time run out."
+)
+
+
+def process_of(record: EpisodeRecord) -> ProcessScore | None:
+    """The score in a record; None for episodes whose environment reports none."""
+    value = record.extra.get(EXTRA)
+    return None if value is None else ProcessScore.from_dict(value)
+
+
+def process_tables(results: Results) -> list[Table]:
+    """A table of every method that has scores."""
+    return [table for method in results.methods if (table := process_table(method, results))]
+
+
+def process_table(method: Method, results: Results) -> Table | None:
+    """Where the chains of one method broke, over all its runs; None without scores."""
+    records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
+    if not records:
+        return None
+    by_task = {task: [r for r in records if r.task == task] for task in results.protocol.tasks}
+    rows = [_row(task, members) for task, members in by_task.items() if members]
+    rows.append(_row("all", records))
+    columns = ["", "episodes", "progress (%)", "success", *OPERATIONS, MOTION, "stuck"]
+    return Table(f"{method.label}: where the chain broke", columns, rows, {len(rows) - 1}, {len(rows) - 1})
+
+
+def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
+    scores = [score for record in records if (score := process_of(record)) is not None]
+    progress = 100 * np.mean([score.done / max(score.of, 1) for score in scores])
+    ends = Counter(score.operation or score.broke or "success" for score in scores)
+    counts = [ends[kind] for kind in ("success", *OPERATIONS, MOTION, "stuck")]
+    return [name, str(len(scores)), f"{progress:.1f}", *("–" if not count else str(count) for count in counts)]

@@ -1,0 +1,179 @@
+"""The policy's side of one running episode: its memory, its subgoal, its clock."""
+
+import hashlib
+import time
+from typing import Any
+
+import numpy as np
+
+from mme_vla.embodiment.action_space import read_options
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import Seconds
+from mme_vla.evaluation.rollout.environment import OPTIONS, Observation
+from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
+from mme_vla.policy.base import Policy
+from mme_vla.subgoal import Subgoal, SubgoalPredictor
+
+_NONE = np.zeros((0, 1, 1, 3), np.uint8)
+
+
+def episode_seed(seed: int, task: str, episode: int) -> int:
+    """The seed of an episode's noise: of these three alone, so that order, batches and resumption do not matter."""
+    digest = hashlib.sha256(f"{seed}/{task}/{episode}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1  # a signed 64-bit integer
+
+
+class RunningEpisode:
+    """One episode between its first observation and its end.
+
+    Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of a conditioning
+    video do not keep other episodes waiting.
+
+    Args:
+        subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        job: Job,
+        seed: int,
+        subgoals: SubgoalPredictor | None = None,
+        piece: int = 32,
+        trace: SubgoalTrace | None = None,
+    ) -> None:
+        self._policy, self._subgoals, self._piece = policy, subgoals, piece
+        self.job, self.trace = job, trace
+        self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
+        self.watched: Any = None
+        """What the subgoal predictor knows of the episode."""
+        self.worker = -1
+        self.steps = self.chunks = 0
+        self.video_frames = 0
+        self.video = ""
+        self.process: dict[str, Any] = {}
+        """Where the chain of sub-tasks broke, once the episode is over; empty where it is not reported."""
+        self.redrawn: int | None = None
+        """Frames of the conditioning video, once it is being simulated again for its images."""
+        self._actions = hashlib.sha256()
+        self._robot = policy.embodiment
+        self._sent = np.zeros((0, self._robot.action.width), np.float32)
+        self._sim = self._render = self._thinking = 0.0
+        self._begun = time.perf_counter()
+        self._frames: Observation = {"state": np.zeros((0, self._robot.state.width), np.float32)}
+        self._demo = np.zeros(0, bool)
+        self._led: np.ndarray | None = None
+        self._info: dict[str, Any] = {}
+        self._at = 0
+
+    def begin(self, frames: Observation, info: dict[str, Any]) -> None:
+        """Take the first observation: a conditioning video, if the task has one, and the current frame."""
+        goal = str(info["task_goal"][0])
+        self.episode.goal = goal
+        if self._robot.action.choice and OPTIONS in info:
+            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
+        self.video_frames = len(frames["state"]) - 1
+        if self._subgoals is not None:
+            needs_video = self.video_frames and self._subgoals.sees_video
+            video = np.stack(frames[self._robot.memory_camera][:-1]) if needs_video else None
+            self.watched = self._subgoals.start_episode(goal, video, self.job.task)
+        self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None, info)
+
+    def resume(self, frames: Observation, info: dict[str, Any]) -> None:
+        """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
+        count = self._count(info)
+        n_frames = count if self._robot.action.frames is not None else len(frames["state"])
+        self._expect(frames, np.zeros(n_frames, bool), self._sent[:count], info)
+
+    def end(self, info: dict[str, Any]) -> None:
+        """Take the report of the last actions; their frames are not needed any more."""
+        self._count(info)
+        self.video = str(info.get("video", ""))
+        self.process = info.get("process", {})
+
+    def add_env_seconds(self, info: dict[str, Any]) -> None:
+        """Add up the environment's time."""
+        seconds = info.get("seconds", {})
+        self._sim += seconds.get("sim", 0.0)
+        self._render += seconds.get("render", 0.0)
+
+    @property
+    def pieces(self) -> int:
+        """Pieces still to be read."""
+        return max(0, -(-(len(self._frames["state"]) - self._at) // self._piece))
+
+    def read(self) -> None:
+        """Take one piece of the waiting frames into memory."""
+        begun = time.perf_counter()
+        part = slice(self._at, self._at + self._piece)
+        views, rendered = self._views(part)
+        views |= {name: np.stack(self._frames[name][part]) for name in self._robot.readings}
+        led = self._led
+        if led is not None:  # one action a frame; or some motions, all given with the first of their frames
+            led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
+        some = (
+            {} if all(len(places) == len(self._demo[part]) for places in rendered.values()) else {"rendered": rendered}
+        )
+        self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
+        if self.watched is not None and not self._demo[part][-1:].any():
+            camera, demo = self._robot.memory_camera, self._demo[part]
+            displayed = views[camera][~demo[rendered[camera]]]
+            if passed := int((~demo).sum()) - len(displayed):
+                self.watched.skip(passed)
+            if len(displayed):
+                self.watched.observe(displayed, self._info)
+        self._at = part.stop
+        self.add_policy_seconds(time.perf_counter() - begun)
+
+    def _views(self, part: slice) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Images of every camera, and their places in this part of the frames."""
+        views, rendered = {}, {}
+        for name in self._robot.camera_names:
+            images = self._frames[name][part]
+            rendered[name] = np.array([i for i, image in enumerate(images) if image is not None], np.int64)
+            views[name] = np.stack([images[i] for i in rendered[name]]) if len(rendered[name]) else _NONE
+        return views, rendered
+
+    def add_policy_seconds(self, seconds: float) -> None:
+        """Add this episode's share of the policy's time."""
+        self._thinking += seconds
+
+    def set_subgoal(self, subgoal: Subgoal, latency_s: float) -> None:
+        """Take the subgoal of the current frame, which came after so many seconds."""
+        self.episode.subgoal = subgoal.text
+        if self.trace is not None:
+            self.trace.add(self.watched, subgoal, latency_s)
+
+    def set_actions(self, actions: np.ndarray) -> None:
+        """Note the actions [n, w] that are sent to the environment."""
+        self._sent = actions
+        self.chunks += 1
+
+    @property
+    def seconds(self) -> Seconds:
+        """Where the time went so far."""
+        total = time.perf_counter() - self._begun
+        return Seconds(
+            sim=round(self._sim, 3), render=round(self._render, 3), policy=round(self._thinking, 3),
+            total=round(total, 3),
+        )  # fmt: skip
+
+    @property
+    def actions_sha256(self) -> str:
+        """A digest of all executed actions: equal for two runs exactly if they did the same to the last bit."""
+        return self._actions.hexdigest()[:16]
+
+    def _count(self, info: dict[str, Any]) -> int:
+        count = int(info.get("executed", 0))
+        self.steps += int(info.get("steps", count))
+        self._actions.update(np.ascontiguousarray(self._sent[:count], np.float32).tobytes())
+        return count
+
+    def _expect(self, frames: Observation, demo: np.ndarray, led: np.ndarray | None, info: dict[str, Any]) -> None:
+        if len(frames["state"]) != len(demo):
+            raise UserError(
+                f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need one frame an action."
+            )
+        self._frames, self._demo, self._led, self._info, self._at = frames, demo, led, info, 0
+        self.episode.begun(info.get("began", ()), self.video_frames)

@@ -1,0 +1,91 @@
+"""The images that a rollout requests of its environments: those that the policy and its predictor read, no others.
+
+When a policy acts is known beforehand, so what its memory reads is too, but for one thing: how long the conditioning
+video is. An episode therefore begins without those of its images that depend on it. Where some turn out to be
+needed, it begins once more, and the same simulation then renders them.
+"""
+
+from collections.abc import Container
+from functools import cache
+
+import numpy as np
+
+from mme_vla.envs.observations import RenderRequest
+from mme_vla.evaluation.rollout.environment import Observation
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.memory.base import past_view_spec
+from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import frames_read
+from mme_vla.subgoal import SubgoalPredictor
+
+EVERY = range(2**31)
+"""Whatever frames there are."""
+LONGEST_VIDEO = 10_000  # frames
+
+
+class RenderPlan:
+    """The images to render for each command to an environment; None requests everything.
+
+    Args:
+        policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
+    """
+
+    def __init__(self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings) -> None:
+        self._policy, self._robot, self._settings = policy, policy.embodiment, settings
+        self._grounded = subgoals is not None and subgoals.kind == "grounded"
+        self._sees_video = subgoals is not None and subgoals.sees_video
+        self._sees_passing = subgoals is not None and subgoals.sees_passing
+        memory = policy.memory
+        every = past_view_spec(memory) is not None
+        self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
+        self._reads = cache(self._reads_of)
+        # Depth and poses of cameras come with every frame.
+        self._all = settings.draw == "all" or bool(self._robot.readings) or self._reads(0) is None
+
+    def before_video(self) -> RenderRequest | None:
+        """For a reset, before it is known how long the video is: what is certain to be wanted."""
+        if self._all:
+            return None
+        memory = self._policy.memory
+        if self._sees_video:
+            return self._render_request(EVERY)
+        # Of memories that keep few frames all are rendered at once, of others none.
+        few = memory is not None and memory.storage.keep_every > 1
+        return self._render_request(
+            frozenset(memory.storage.stored_frames(LONGEST_VIDEO).tolist()) if memory and few else ()
+        )
+
+    def missing(self, frames: Observation) -> RenderRequest | None:
+        """For a second reset, after one that gave these frames; None where it gave all that is needed."""
+        if self._all:
+            return None
+        video = len(frames["state"]) - 1
+        needed = range(video) if self._sees_video else self._within(video, 0, video)
+        if all(frames[self._robot.memory_camera][frame] is not None for frame in needed):
+            return None
+        return self._render_request(frozenset(needed))
+
+    def of_chunk(self, n_observed: int, count: int, exec_start: int) -> RenderRequest | None:
+        """For `count` actions after `n_observed` frames, of which the first `exec_start` were the video."""
+        if self._all:
+            return None
+        if self._sees_passing:
+            return self._render_request(EVERY)
+        stop = n_observed + count if self._robot.action.frames is not None else EVERY.stop
+        return self._render_request(frozenset(self._within(exec_start, n_observed, stop)))
+
+    def _render_request(self, frames: Container[int]) -> RenderRequest:
+        return RenderRequest(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)
+
+    def _within(self, exec_start: int, first: int, stop: int) -> list[int]:
+        reads = self._reads(exec_start)
+        assert reads is not None
+        frames: list[int] = reads[(reads >= first) & (reads < stop)].tolist()
+        return frames
+
+    def _reads_of(self, exec_start: int) -> np.ndarray | None:
+        """Frames that the policy reads of an episode with this video, until its step limit."""
+        # A motion takes any number of frames, so that the policy may act at each.
+        action = self._robot.action
+        apart = 1 if action.frames is None else min(self._settings.execute or action.execute, action.horizon)
+        return frames_read(self._policy, exec_start + np.arange(0, self._settings.max_steps + 2, apart), exec_start)

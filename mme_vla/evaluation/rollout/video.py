@@ -1,0 +1,89 @@
+"""An episode as a video: all cameras side by side, the conditioning part in a red border, the subgoal below."""
+
+import re
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from mme_vla.utils import draft_of
+from mme_vla.utils.media import VideoWriter, video_frame
+
+SAVE_ON = ("none", "all", "success", "failure")
+BEHIND = 64
+"""Frames that may wait to be compressed."""
+_LONGEST_GOAL = 100  # characters of a file name
+
+
+class EpisodeVideo:
+    """Draws and compresses frame by frame, so that no episode is held in memory.
+
+    A thread compresses beside the simulation, which waits only when it is `BEHIND` frames ahead.
+    The file gets its name, with the outcome, when the episode is over; until then it is a hidden file beside it.
+
+    Args:
+        path: of the video, from outcome and goal.
+        kept: which outcomes are kept: `all`, `success` or `failure`.
+    """
+
+    def __init__(self, path: Callable[[str, str], Path], save_on: str = "all") -> None:
+        self._path, self._save_on = path, save_on
+        self._video: VideoWriter | None = None
+        self._draft = Path()
+        self._thread: ThreadPoolExecutor | None = None
+        self._waiting: deque[Future[None]] = deque()
+
+    def add(self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False) -> None:
+        """Append the images [H, W, 3] uint8 that all cameras took at one step."""
+        if self._video is None:
+            self._video, self._thread = self._open(), ThreadPoolExecutor(1, "film")
+        assert self._thread is not None
+        self._waiting.append(self._thread.submit(self._video.add, video_frame(views, caption, demo)))
+        while len(self._waiting) > BEHIND:
+            self._waiting.popleft().result()
+
+    def finish(self, outcome: str, goal: str) -> Path | None:
+        """Close the video under its name; None if this outcome is not kept."""
+        if self._video is None or self._save_on not in ("all", "success" if outcome == "success" else "failure"):
+            self.discard()
+            return None
+        self._compressed()
+        self._video.close()
+        target = self._path(outcome, goal)
+        self._draft.replace(target)
+        self._video = None
+        return target
+
+    def discard(self) -> None:
+        """Drop the frames."""
+        if self._video is not None:
+            for frame in self._waiting:
+                frame.cancel()
+            self._compressed(complete=False)
+            self._video.close(complete=False)
+            self._draft.unlink(missing_ok=True)
+            self._video = None
+
+    def _compressed(self, complete: bool = True) -> None:
+        """Wait for the thread; with `complete`, what went wrong in it is raised."""
+        if self._thread is not None:
+            self._thread.shutdown()
+        waiting, self._waiting, self._thread = self._waiting, deque(), None
+        for frame in waiting if complete else ():
+            frame.result()
+
+    def _open(self) -> VideoWriter:
+        folder = self._path("", "").parent
+        folder.mkdir(parents=True, exist_ok=True)
+        self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
+        return VideoWriter(self._draft)
+
+
+def video_name(task: str, episode: int, outcome: str, goal: str) -> str:
+    """`PickXtimes_ep3_success_pick_up_the_red_cube.mp4`."""
+    words = re.sub(r"[^a-z0-9]+", "_", goal.lower()).strip("_")
+    if len(words) > _LONGEST_GOAL:
+        words = words[:_LONGEST_GOAL].rpartition("_")[0]
+    return "_".join(part for part in (task, f"ep{episode}", outcome, words) if part) + ".mp4"

@@ -1,0 +1,358 @@
+"""The files of a run's folder: settings (`run.json`), records (`episodes.jsonl`) and claims (`claims/`)."""
+
+import fcntl
+import hashlib
+import json
+import os
+import re
+import socket
+import time
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+from urllib.parse import quote, unquote
+
+from mme_vla.config.sections import read_section
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError, brief
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compositions, finished
+from mme_vla.utils import (
+    draft_of,
+    is_alive,
+    name_place,
+    read_json,
+    read_lines,
+    remove_drafts,
+    to_json,
+    verified,
+    with_checksum,
+)
+
+RUN_FILE = "run.json"
+INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base_url", "timeout", "retries", "backoff",
+               "requests_per_minute", "input_price", "output_price")  # fmt: skip
+"""Options of a model that predicts or plays which do not affect its output, and may differ when a run continues."""
+
+
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """SHA-256 of the settings, whatever the order of their keys."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Begin a run in `folder`, or continue with the one that is there.
+
+    Args:
+        settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, …
+        notes: what does not (device, workers, versions); written down when the run begins, never compared.
+
+    Returns:
+        What `run.json` holds. Several shards may claim the same folder at once: the first writes it.
+    """
+    settings = to_json(settings)  # as they will be read back
+    content = {
+        "settings": settings,
+        "fingerprint": fingerprint(settings),
+        "notes": dict(notes or {}),
+        "begun": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        _write_new(folder / RUN_FILE, json.dumps(with_checksum(content), indent=2, sort_keys=True) + "\n")
+        return content
+    except FileExistsError:
+        _await_content(folder / RUN_FILE)
+    there = read_run(folder)
+    if there["fingerprint"] != content["fingerprint"]:
+        raise UserError(
+            f"{folder} holds a run with other settings: {_differences(there['settings'], settings)}. "
+            "Resume it with its own settings, or choose another folder."
+        )
+    return there
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """Read a folder's `run.json`."""
+    path = folder / RUN_FILE
+    content = read_json(path, "a run's settings", finite=False)
+    if not isinstance(content.get("settings"), dict) or not isinstance(content.get("fingerprint"), str):
+        raise UserError(
+            f"{path} is damaged: it lacks settings or their fingerprint; remove it if the records beside "
+            "it are of this run."
+        )
+    if content["fingerprint"] != fingerprint(content["settings"]):
+        raise UserError(f"{path} was changed manually: its settings do not have its fingerprint.")
+    return verified(content, str(path))
+
+
+def _write_new(target: Path, text: str) -> None:
+    """Write a file that is not there yet.
+
+    Raises:
+        FileExistsError: it is.
+    """
+    remove_drafts(target.parent)
+    mine = draft_of(target)
+    mine.write_text(text)
+    try:
+        os.link(mine, target)  # whole or not at all, and never over another's
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        with target.open("x") as file:
+            file.write(text)
+    finally:
+        mine.unlink(missing_ok=True)
+
+
+def _await_content(path: Path, patience: float = 2) -> None:
+    """Without hard links another process may have made the file, but not filled it yet."""
+    end = time.monotonic() + patience
+    while path.stat().st_size == 0 and time.monotonic() < end:
+        time.sleep(0.05)
+
+
+def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    before, after = _flat(there), _flat(now)
+    changed = [key for key in sorted({*before, *after}) if before.get(key, _NOTHING) != after.get(key, _NOTHING)]
+    changes = (
+        f"{key} was {brief(before.get(key, 'not set'))}, is {brief(after.get(key, 'not set'))}" for key in changed
+    )
+    return "; ".join(changes)
+
+
+_NOTHING = object()
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat
+
+
+RECORDS = "episodes.jsonl"
+"""Name of a run's file; its shards are called `episodes-<shard>.jsonl`."""
+
+
+class RecordLog:
+    """Appends records to a file, each on disk when `append` returns. A context manager.
+
+    One process a file: the shards of a run write `episodes-<shard>.jsonl` side by side.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open or create `path`, and remove a half-written last line."""
+        self.path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file: IO[bytes] = path.open("ab+")
+        try:
+            _lock(self._file, path)
+            self._repair()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def append(self, record: EpisodeRecord) -> None:
+        """Write one record."""
+        self._file.write(record.to_json().encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        name_place(error, self.path)
+        try:
+            self.close()
+        except OSError:  # what a full disk did not take is tried once more on closing
+            if error is None:
+                raise
+
+    def _repair(self) -> None:
+        self._file.seek(0)
+        content = self._file.read()
+        last_line = content.rpartition(b"\n")[2]
+        if not last_line:
+            return
+        try:
+            EpisodeRecord.from_json(last_line)
+        except UserError:
+            warnings.warn(f"{self.path}: removed a half-written last line ({len(last_line)} bytes).", stacklevel=3)
+            self._file.truncate(len(content) - len(last_line))
+        else:  # only the line's end is missing
+            self._file.write(b"\n")
+
+
+def read_records(path: Path) -> list[EpisodeRecord]:
+    """Read a file of records; a half-written last line is ignored with a warning."""
+    return read_lines(path, EpisodeRecord.from_dict, "episode records", finite=False)
+
+
+def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
+    """Read files of records; those of one folder belong together (`complete_compositions`)."""
+    folders: dict[Path, list[EpisodeRecord]] = {}
+    for path in paths:
+        folders.setdefault(path.resolve().parent, []).extend(read_records(path))
+    return [record for records in folders.values() for record in complete_compositions(records)]
+
+
+def find_records(paths: Iterable[Path]) -> list[Path]:
+    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl` below it."""
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(path.rglob("episodes*.jsonl"))
+            if not inside:
+                raise UserError(f"{path} holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below.")
+            files += inside
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise UserError(f"{path} does not exist: name files of episode records, or folders with {RECORDS}.")
+    return list({path.resolve(): path for path in files}.values())
+
+
+def _lock(file: IO[bytes], path: Path) -> None:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UserError(
+            f"{path} is being written by another process; give every shard a file of its own, episodes-<shard>.jsonl."
+        ) from None
+    except OSError:  # a file system without locks
+        return
+
+
+CLAIMS = "claims"
+"""Folder of a run's claims."""
+_CLAIM = re.compile(r"(?P<task>.+)-(?P<episode>\d+)\.(?P<number>\d+)\.json")
+_RECORDS = re.compile(r"episodes(-\d+of\d+)?\.jsonl")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One process's claim on an episode.
+
+    records: name of the file that the process holds and writes its records to; None gives the episode back.
+    host, process: of the writer, for file systems without locks.
+    """
+
+    records: str | None
+    host: str = field(default_factory=socket.gethostname)
+    process: int = field(default_factory=os.getpid)
+
+    def __post_init__(self) -> None:
+        if self.records is not None and not _RECORDS.fullmatch(self.records):
+            raise UserError(f"records={brief(self.records)} must name a file of records, such as {RECORDS}.")
+        if self.process < 1:
+            raise UserError(f"process={self.process} must be a process number.")
+
+
+class Claims:
+    """The claims on a run's episodes, as one of its processes sees them.
+
+    `claims/<task>-<episode>.<n>.json` is claim number n on an episode. Each is created exclusively and never changed
+    or removed, so that two processes never hold the same one, on network file systems too. The newest claim counts.
+    It holds while its process locks its file of records, and where that file has the episode's result.
+    """
+
+    def __init__(self, folder: Path, records: str) -> None:
+        """Join the run. Gives back what an earlier process with the same file of records had not finished.
+
+        Args:
+            folder: of the run. records: the name of the file that this process holds and writes its records to.
+        """
+        self.folder, self.records = folder, records
+        self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}
+        for path in sorted((folder / CLAIMS).glob("[!.]*.json")):
+            if match := _CLAIM.fullmatch(path.name):
+                key, number = EpisodeKey(unquote(match["task"]), int(match["episode"])), int(match["number"])
+                if number > self._newest.get(key, (-1, None))[0]:
+                    self._newest[key] = number, _read_claim(path)
+        done = _finished_in(folder / records)
+        for key, (number, claim) in list(self._newest.items()):
+            if claim.records == records and key not in done:
+                self._create(key, number + 1, Claim(None))
+
+    def take(self, waiting: Sequence[Job]) -> Job | None:
+        """Claim the first episode that no process runs or has finished; None where all are taken."""
+        finished_by: dict[str, set[EpisodeKey] | None] = {}
+        for job in waiting:
+            key = EpisodeKey(job.task, job.episode)
+            while True:
+                number, claim = self._newest.get(key, (-1, None))
+                if claim is not None and self._holds(claim, key, finished_by):
+                    break
+                if self._create(key, number + 1, Claim(self.records)):
+                    return job
+        return None
+
+    def _holds(self, claim: Claim, key: EpisodeKey, finished_by: dict[str, set[EpisodeKey] | None]) -> bool:
+        """Whether the claim's process is alive (None in `finished_by`) or has finished the episode."""
+        records = claim.records
+        if records is None:
+            return False
+        if records not in finished_by:
+            path = self.folder / records
+            finished_by[records] = None if records == self.records or _is_held(path, claim) else _finished_in(path)
+        done = finished_by[records]
+        return done is None or key in done
+
+    def _create(self, key: EpisodeKey, number: int, claim: Claim) -> bool:
+        """Write a claim; False where another process was first, whose claim is noted."""
+        path = self.folder / CLAIMS / f"{quote(key.task, safe='')}-{key.episode}.{number}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        is_first = not path.exists()
+        if is_first:
+            try:
+                _write_new(path, json.dumps(asdict(claim)) + "\n")
+            except FileExistsError:
+                is_first = False
+        self._newest[key] = number, claim if is_first else _read_claim(path)
+        return is_first
+
+
+def _read_claim(path: Path) -> Claim:
+    _await_content(path)
+    try:
+        return read_section(Claim, read_json(path, "a claim on an episode", limit=4096))
+    except UserError as error:
+        raise UserError(
+            f"{path} is damaged: {error} Remove the folder {path.parent} while no process of the run is alive: "
+            "nothing of the run is lost."
+        ) from None
+
+
+def _finished_in(path: Path) -> set[EpisodeKey]:
+    return finished(read_records(path)) if path.exists() else set()
+
+
+def _is_held(path: Path, claim: Claim) -> bool:
+    """Whether a process writes to a file of records.
+
+    Where the file system has no locks, a process of this machine is looked up by its number, and others are alive.
+    """
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return claim.host != socket.gethostname() or is_alive(claim.process)
+    finally:
+        os.close(file)
+    return False

@@ -1,0 +1,45 @@
+"""Memory as video: one vector, joined to the condition that scales and shifts every block of a denoising network."""
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError, brief
+from mme_vla.integration.base import Integration, required
+from mme_vla.registry import INTEGRATIONS
+from mme_vla.types import MemoryTokens
+
+
+class PooledIntegration(Integration):
+    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one says it hosts `vector`."""
+
+    required_features = frozenset({"vector"})
+    feature_width: int
+
+    def feature(self, memory: MemoryTokens | None) -> Tensor:
+        """Memory tokens [b, n, d] → [b, feature_width]."""
+        raise NotImplementedError
+
+
+@INTEGRATIONS.register("film")
+class FiLM(PooledIntegration):
+    """The mean of the memory's tokens, normed and projected."""
+
+    def __init__(self, backbone: Any, width: int = 64) -> None:
+        """Build it.
+
+        Args:
+            backbone: sizes, of no concern here. width: of the memory tokens and of the vector.
+        """
+        super().__init__(backbone)
+        if isinstance(width, bool) or not isinstance(width, int) or width < 1:
+            raise UserError(f"integration.width={brief(width)} must be a positive whole number.")
+        self.memory_width = self.feature_width = width
+        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, width)
+
+    def feature(self, memory: MemoryTokens | None) -> Tensor:
+        features = required(memory)
+        counted = features.mask[..., None].to(features.tokens.dtype)
+        # Tokens where the mask is False are undefined: zero them before they are weighed.
+        tokens = features.tokens.masked_fill(~features.mask[..., None], 0)
+        return self.out(self.norm(tokens.sum(1) / counted.sum(1).clamp(min=1)))

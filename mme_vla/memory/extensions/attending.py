@@ -1,0 +1,79 @@
+"""A small pre-norm transformer block that memories put together: some tokens read others, then an MLP."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule, all_patches, union_frames
+from mme_vla.memory.history import History
+
+MLP = 4
+"""Width of a block's MLP, in widths of its tokens."""
+
+
+def heads_of(hidden: int, heads: int | None) -> int:
+    """So many heads; None is one for each 64 of `hidden`, at least 2."""
+    heads = heads or max(2, hidden // 64)
+    if heads < 1 or hidden % heads:
+        raise UserError(f"memory.heads={heads} does not divide memory.hidden={hidden}.")
+    return heads
+
+
+class ReadingBlock(nn.Module):
+    """x ← x + attention(x → [context]); x ← x + MLP(x). `context` may hold x itself."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.head_dim = width // heads
+        self.norm, self.context_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width), nn.LayerNorm(width)
+        self.q, self.kv, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
+        self.up, self.down = nn.Linear(width, MLP * width), nn.Linear(MLP * width, width)
+
+    def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
+        """Let x [b, q, d] read context [b, k, d] where mask, bool [b, q, k], says so; a row of no one's reads all."""
+        q = self.q(self.norm(x)).unflatten(-1, (-1, self.head_dim))
+        k, v = self.kv(self.context_norm(context)).unflatten(-1, (-1, self.head_dim)).chunk(2, -2)
+        q, k, v = (part.transpose(1, 2) for part in (q, k, v))
+        # A row that may read nothing is padding: reading all keeps it finite.
+        key_mask = (mask | ~mask.any(-1, keepdim=True))[:, None]
+        read = functional.scaled_dot_product_attention(q, k, v, attn_mask=key_mask)
+        x = x + self.out(read.transpose(1, 2).flatten(2))
+        return x + self.down(functional.gelu(self.up(self.mlp_norm(x))))
+
+
+def not_later(queries: Tensor, keys: Tensor) -> Tensor:
+    """Which keys belong to a query's frame or an earlier one: frame numbers [b, q] and [b, k] → bool [b, q, k]."""
+    return keys[:, None, :] <= queries[:, :, None]
+
+
+def by_frame(x: Tensor, patches: int) -> Tensor:
+    """Tokens [b, t·p, …] of whole frames as [b, t, p, …]."""
+    return x.unflatten(1, (-1, patches))
+
+
+def rows_at(x: Tensor, at: Tensor) -> Tensor:
+    """The rows at [b, k] of x [b, n, …]: [b, k, …]."""
+    index = at.view(*at.shape, *[1] * (x.ndim - 2)).expand(-1, -1, *x.shape[2:])
+    return torch.gather(x, 1, index)
+
+
+class FrameMemory(MemoryModule):
+    """A subclass says which frames; all tokens of these are selected, and as many as there are."""
+
+    @abstractmethod
+    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+        """The frames that are read at `step` of an episode whose execution begins at `exec_start`; int64, ascending."""
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return union_frames([self.chosen(int(step), exec_start) for step in steps])
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        return all_patches(self.chosen(step, history.exec_start), self.storage.grid)
+
+    def padded_length(self, count: int) -> int:
+        return count

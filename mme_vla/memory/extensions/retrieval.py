@@ -1,0 +1,99 @@
+"""Retrieval: the stretches of the past that look most like the current view, found before any frame is sampled.
+
+After the retrieval step of SoumilRathi/robomme-interference (at 48d62faa, read and not copied): a history is cut where
+the cosine between neighbouring frames falls below a threshold, a chunk is worth its highest cosine with the frame that
+asks, and the best chunk's span is handed to the policy's own sampler. There frames were embedded by SigLIP anew; here a
+frame is the mean of its stored tokens, which are there already, so their threshold of 0.923 does not carry over.
+Choices of ours: a chunk ends with the conditioning video and has at most `longest` frames; the chunk that holds the
+current frame always looks like it, and is therefore not asked but fills what is left over; as many chunks are taken, in
+the order of likeness, as the budget holds; and of the chunk that does not fit whole, evenly spaced frames.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.memory.base import all_patches
+from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.framesamp import evenly_spaced_frames
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.registry import MEMORIES
+
+
+@MEMORIES.register("retrieval")
+class Retrieval(PerceptualMemory):
+    """budget / grid² frames: of the chunks most like the newest stored frame, and that frame itself."""
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        budget: int = 512,
+        grid: int = 4,
+        pooling: str = "mean",
+        every: int = 4,
+        cut: float = 0.95,
+        longest: int = 8,
+        **encoder: Any,
+    ) -> None:
+        """See `PerceptualMemory`.
+
+        Args:
+            grid, pooling: a remembered frame is grid×grid tokens.
+            every: frames 0 and k·every − 1 are stored, compared and remembered; 1: all. The newest of them asks.
+            cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1 never cuts.
+            longest: most stored frames of a chunk.
+        """
+        if budget % grid**2 or budget < grid**2:
+            raise UserError(
+                f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
+                f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}."
+            )
+        if not -1 <= cut <= 1:
+            raise UserError(f"memory.cut={cut} is a cosine: it lies between -1 (never cut) and 1 (cut everywhere).")
+        if longest < 1:
+            raise UserError(f"memory.longest={longest} must be at least 1: the stored frames of a chunk.")
+        super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
+        self.frames, self.cut, self.longest = budget // grid**2, cut, longest
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        frames = self.storage.stored_frames(step + 1)
+        if len(frames) > self.frames:
+            frames = frames[self.alike(self.frame_features(history, frames), frames >= history.exec_start)]
+        return all_patches(frames, self.storage.grid)
+
+    def frame_features(self, history: History, frames: np.ndarray) -> Tensor:
+        """What stored frames [n] look like: [n, d_vision] of length 1, from their tokens as they are stored."""
+        tokens = history.stored(all_patches(frames, self.storage.grid)).float()
+        return torch.nn.functional.normalize(tokens.unflatten(0, (len(frames), -1)).mean(1), dim=-1)
+
+    def alike(self, features: Tensor, execution: np.ndarray) -> np.ndarray:
+        """Which frames are remembered.
+
+        Args:
+            features: of the stored frames, [n, d], of length 1. execution: bool [n], False in the video.
+
+        Returns:
+            int64 [`frames`], ascending, the newest last.
+        """
+        near = (features[1:] * features[:-1]).sum(1).cpu().numpy()
+        likeness = (features @ features[-1]).cpu().numpy()
+        chunks = chunks_of(near < self.cut, execution, self.longest)
+        ranked = sorted(chunks[:-1], key=lambda chunk: -likeness[chunk].max())
+        taken, remaining = [np.array([len(features) - 1])], self.frames - 1
+        for chunk in [*ranked, chunks[-1][:-1]]:
+            if remaining and len(chunk):
+                picked = chunk if len(chunk) <= remaining else chunk[evenly_spaced_frames(len(chunk) - 1, remaining)]
+                taken.append(picked)
+                remaining -= len(picked)
+        return np.sort(np.concatenate(taken))
+
+
+def chunks_of(cuts: np.ndarray, execution: np.ndarray, longest: int) -> list[np.ndarray]:
+    """Split n frames where `cuts` [n − 1] says so, where the video ends, and into pieces of at most `longest`."""
+    ends = cuts | (np.diff(execution.astype(int)) != 0)
+    runs = np.split(np.arange(len(execution)), np.flatnonzero(ends) + 1)
+    return [run[start : start + longest] for run in runs for start in range(0, len(run), longest)]

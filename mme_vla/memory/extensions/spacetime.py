@@ -1,0 +1,118 @@
+"""Spacetime: past images enter the vision tower itself, and past states are tokens (MEM, LeRobot's option of π0.5).
+
+After MEM's short-horizon memory (arXiv 2603.03596) as LeRobot's π0.5 has it (`use_visual_memory`,
+`use_proprioceptive_memory`; huggingface/lerobot#4076, read and not copied): six frames a second apart; every fourth
+layer of the tower lets each patch look at the same patch of the frames before it, with the layer's own weights, and
+what the tower made of past frames is dropped above the last such layer. So the prefix is no longer than before, and no
+weight is added. Each frame's state, normalised and padded with zeros, becomes one token through one linear layer.
+
+LeRobot takes the state out of the prompt where states are tokens; here prompts hold none unless a format asks for it.
+There the tokens stand between images and words; here the integration says where they go, and
+`integration.mutual=true` of `context` puts them there. Frames of the conditioning video are past frames as any other.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule, PastViewMemory, PastViewSpec, ProprioMemory, union_frames
+from mme_vla.memory.extensions.actions import NEVER, MotionRows
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.registry import MEMORIES
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+
+@MEMORIES.register("spacetime")
+class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
+    """Views of `frames` frames for the tower, and their states as so many tokens; `select` names the frames.
+
+    No cache serves it: it would have to hold what every layer that looks through time makes of every frame of every
+    camera, where others store one pooled grid of one camera. So images are read anew, in training too.
+    """
+
+    timed = True
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        frames: int = 6,
+        stride: int = 10,
+        every: int = 4,
+        views: bool = True,
+        states: bool = True,
+        state_dim: int = 32,
+        budget: int | None = None,
+    ) -> None:
+        """Say what is looked at.
+
+        Args:
+            d_vision: width of a vision token, to which a state is padded on its way. width: of a memory token.
+            frames: how many, the current one among them. stride: frames between two.
+            every: each so-many-th layer of the tower looks through time, and at least its last.
+            views: give the tower past images. states: hand over past states as tokens.
+            state_dim: numbers a state is padded to before its layer.
+            budget: most memory tokens there is room for; None for as many as there are frames, which it takes at least.
+        """
+        super().__init__()
+        for name, value in {"frames": frames, "stride": stride, "every": every, "state_dim": state_dim}.items():
+            if value < 1:
+                raise UserError(f"memory.{name}={value} must be at least 1.")
+        if not (views or states):
+            raise UserError("memory.views=false and memory.states=false leave nothing to remember: set one of them.")
+        if budget is not None and states and budget < frames:
+            raise UserError(f"memory.budget={budget}: the states of memory.frames={frames} are as many tokens.")
+        if states and state_dim > d_vision:
+            raise UserError(f"memory.state_dim={state_dim}: this backbone's tokens, {d_vision} wide, carry the states.")
+        self.frames, self.stride, self.every = frames, stride, every
+        self.width, self.state_dim = width, state_dim
+        self.d_vision = d_vision
+        self.past_view_spec = PastViewSpec(frames, stride, every) if views else None
+        self.uses_proprio = states
+        self.budget = self.capacity = frames if states else 0
+        self.storage = StorageSpec(1, "mean", NEVER)
+        self.states = nn.Linear(state_dim, width) if states else None
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        if self.past_view_spec is None:
+            return np.zeros(0, np.int64)
+        read = union_frames([self.past_view_spec.at(int(step)) for step in steps])
+        return read[read >= 0]
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        frames: np.ndarray = step - self.stride * np.arange(self.frames - 1 if self.budget else -1, -1, -1)
+        frames = frames[frames >= 0]
+        return np.stack([frames, np.zeros_like(frames)], 1)
+
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        return super().gather_selection(
+            MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng
+        )
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        if self.states is None:
+            tokens = history.features.new_zeros(*history.mask.shape, self.width)
+            return MemoryTokens(tokens, history.mask, ages=history.ages)
+        weight, ages = self.states.weight, history.ages
+        tokens = self.states(history.features[..., : self.state_dim].to(weight))  # an episode's states are on the CPU
+        return MemoryTokens(
+            tokens, history.mask.to(weight.device), ages=None if ages is None else ages.to(weight.device)
+        )
+
+    def _proprio_rows(self, history: History) -> Callable[[np.ndarray], Tensor]:
+        """Rows that stand for frames [n]: the robot's states, at most as wide as their layer; nothing without them."""
+
+        def rows(frames: np.ndarray) -> Tensor:
+            if self.states is None:
+                return torch.zeros(len(frames), self.d_vision)
+            proprio = history.proprio(frames)
+            if proprio.shape[1] > self.state_dim:
+                raise UserError(
+                    f"memory.state_dim={self.state_dim}: a state of this robot has {proprio.shape[1]} numbers."
+                )
+            return proprio
+
+        return rows

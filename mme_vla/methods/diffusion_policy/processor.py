@@ -1,0 +1,263 @@
+"""What stands between raw data and Diffusion Policy: images as they are, extremes, a text's vector, a window."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.action_space import integer
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
+from mme_vla.memory.base import stack_history
+from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
+from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, Sample, SampleSpec, StatsSpec
+from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
+from mme_vla.processing.normalise import NormStats, normalize, unnormalize
+from mme_vla.registry import PROCESSORS
+from mme_vla.types import HistoryTokens, TensorStruct
+
+if TYPE_CHECKING:
+    from transformers import CLIPTextModelWithProjection
+
+
+CLIP = "openai/clip-vit-base-patch32"
+CLIP_WIDTH = 512
+LONGEST = 77
+"""Tokens that CLIP reads."""
+
+
+class HashedWords(GoalEncoder):
+    """The sum of one fixed random direction a word: equal words, equal vectors. To try things out without CLIP."""
+
+    def encode(self, text: str) -> Tensor:
+        total = torch.zeros(self.width)
+        for word in text.lower().split() or [""]:
+            total += direction_of(word, self.width)
+        return functional.normalize(total, dim=0)
+
+
+class ClipText(GoalEncoder):
+    """CLIP's text tower and projection, frozen, on the CPU; loaded with the first text."""
+
+    def __init__(self, width: int, source: str | Path = CLIP) -> None:
+        """Remember where it is.
+
+        Args:
+            source: the hub's name of a CLIP, or a folder as transformers writes them.
+        """
+        super().__init__(width)
+        self.source = str(source)
+
+    @cached_property
+    def _parts(self) -> tuple[Any, "CLIPTextModelWithProjection"]:
+        try:
+            from transformers import CLIPTextModelWithProjection, CLIPTokenizer
+        except ImportError:
+            raise missing_extra("Diffusion Policy", "baselines") from None
+        try:
+            tokenizer = CLIPTokenizer.from_pretrained(self.source)
+            tower = CLIPTextModelWithProjection.from_pretrained(self.source)
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]}). Connect once so that it "
+                "is kept, give a folder that holds it (processor.text=<folder>), or try things out with "
+                "processor.text=hashed."
+            ) from None
+        if tower.config.projection_dim != self.width:
+            raise UserError(
+                f"{self.source} gives {tower.config.projection_dim} numbers a text, the network reads {self.width}: "
+                "set backbone.text_dim."
+            )
+        return tokenizer, tower.eval().requires_grad_(False)
+
+    def encode(self, text: str) -> Tensor:
+        tokenizer, tower = self._parts
+        read = tokenizer([text], padding="longest", truncation=True, max_length=LONGEST, return_tensors="pt")
+        return text_features(tower, read["input_ids"], read["attention_mask"])[0]
+
+
+@torch.no_grad()
+def text_features(tower: "CLIPTextModelWithProjection", ids: Tensor, mask: Tensor) -> Tensor:
+    """Token ids and mask [b, l] → the projected state of each end of text, of unit length [b, d]."""
+    return functional.normalize(tower(input_ids=ids, attention_mask=mask).text_embeds, dim=-1)
+
+
+def text_encoder(name: str, width: int) -> GoalEncoder:
+    """The encoder called `hashed` or `clip`, or a CLIP in a folder of one's own."""
+    if name == HASHED:
+        return HashedWords(width)
+    return ClipText(width, CLIP if name == "clip" else name)
+
+
+FRAMES = ("consecutive", "asked")
+CLIP_NAME = "clip"
+BY = "extremes"
+
+
+@dataclass
+class DiffusionBatch(TensorStruct):
+    """Inputs of Diffusion Policy, and for training its targets.
+
+    images: [b, t, v, 3, H, W] uint8; the window's images, the current ones last. state: [b, t, s] normalised.
+    text: [b, d] the goal's vector. actions: [b, h, a] normalised. action_mask: [b, h] bool; None counts all steps.
+    history: the memory's selection, None for a policy without memory.
+    """
+
+    images: Tensor
+    state: Tensor
+    text: Tensor
+    actions: Tensor | None = None
+    action_mask: Tensor | None = None
+    history: HistoryTokens | None = None
+
+
+@PROCESSORS.register("diffusion_policy")
+class DiffusionProcessor(PolicyProcessor):
+    """Images of one size without augmentation, states and actions between their extremes, and the goal's vector."""
+
+    stats_spec = StatsSpec(horizon=1, every=True, extremes=True)
+
+    def __init__(
+        self,
+        picture: Sequence[int],
+        embodiment: Embodiment,
+        text: str = CLIP_NAME,
+        text_dim: int = 512,
+        window: int = 1,
+        frames: str = "consecutive",
+        memory_size: int = 224,
+        stats: NormStats | None = None,
+    ) -> None:
+        """Put it together.
+
+        Args:
+            image: (height, width) of the images before cropping; images of this size are left as they are.
+            text: `clip`, `hashed`, or the folder of a CLIP. text_dim: width of its vectors.
+            window: frames of an observation. frames: `consecutive`, or `asked`: those at which the policy was asked.
+            memory_size: side of the images that a memory's vision tower reads.
+        """
+        if frames not in FRAMES:
+            raise UserError(f"processor.frames={brief(frames)}. {did_you_mean(str(frames), FRAMES)}")
+        if isinstance(window, bool) or not isinstance(window, int) or not 1 <= window <= 64:
+            raise UserError(f"processor.window={brief(window)} must be a whole number from 1 to 64.")
+        if not isinstance(text, str) or not text:
+            raise UserError(f"processor.text={brief(text)} must be clip, hashed, or the folder of a CLIP.")
+        height, width = picture
+        self.picture = (integer(height, "processor.picture"), integer(width, "processor.picture"))
+        self.embodiment = embodiment
+        self.text_name, self.text = text, text_encoder(text, integer(text_dim, "processor.text_dim"))
+        self.samples = SampleSpec(window=window, consecutive=frames == FRAMES[0])
+        self.memory_size = integer(memory_size, "processor.memory_size")
+        self.stats = stats
+
+    @classmethod
+    def from_sections(cls, sections: Mapping[str, Any]) -> Self:
+        from mme_vla.methods.diffusion_policy.config import DiffusionSizes
+
+        sizes, settings = DiffusionSizes.from_dict(sections["backbone"]), dict(sections["processor"])
+        settings.pop("name", None)
+        for key in settings:
+            if key not in ("text", "window", "frames", "stats"):
+                known = ("text", "window", "frames")
+                raise UserError(f"processor has no key {brief(key)}. {did_you_mean(str(key), known)}")
+        stats = settings.pop("stats", None)
+        return cls(
+            sizes.picture, embodiment_of(sections), text_dim=sizes.text_dim, memory_size=sizes.memory_tower.image_size,
+            stats=None if stats is None else NormStats.load(stats), **settings,
+        )  # fmt: skip
+
+    @property
+    def prompt_spec(self) -> PromptSpec:
+        return PromptSpec(self.text_name)
+
+    # Observations
+
+    def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
+        """Images of all cameras [v, 3, H, W] uint8, or [n, v, 3, H, W]; with black bars where the shape is another."""
+        names = self.embodiment.camera_names
+        if len(views) != len(names):
+            raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
+        resized = [resize_with_pad_uint8(as_uint8_frames(view), self.picture) for view in views]
+        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3)))
+
+    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
+        """Memory frames [n, H, W, 3] uint8 as [n, 3, s, s] float32 in [−1, 1]."""
+        array = frames if isinstance(frames, Tensor) else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
+        return resize_with_pad(array.to(device) if device is not None else array, self.memory_size)
+
+    def prompt(
+        self,
+        goal: str,
+        subgoal: str | None = None,
+        state: np.ndarray | Tensor | None = None,
+        past_actions: np.ndarray | Tensor | None = None,
+    ) -> Tensor:
+        """The goal's vector [d]; nothing else is read."""
+        return self.text(goal)
+
+    def states(self, raw: np.ndarray | Tensor) -> Tensor:
+        """Raw states [..., s] between their extremes, −1 … 1."""
+        return normalize(torch.as_tensor(raw, dtype=torch.float32), self.require_stats().state, BY)
+
+    # Actions
+
+    def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
+        """Recorded actions [h, w] between their extremes, relative first if the embodiment says so."""
+        raw, at = (torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
+        return normalize(self.embodiment.action.to_relative(raw, at), self.require_stats().actions, BY)
+
+    def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
+        """A chunk [..., h, a] as actions [..., h, w]: the inverse of `actions`."""
+        predicted = unnormalize(chunk.float(), self.require_stats().actions, BY)
+        return self.embodiment.action.to_absolute(predicted, state.to(predicted))
+
+    # Batches
+
+    def item(self, sample: Sample) -> dict[str, Any]:
+        """One training step: the window's images and states, the goal's vector, the chunk."""
+        return {
+            "images": self.images(list(sample.views.values())),
+            "state": self.states(sample.states),
+            "text": self.prompt(sample.goal),
+            "actions": self.actions(sample.actions, sample.states[-1]),
+        }
+
+    def collate(self, items: Sequence[dict[str, Any]]) -> DiffusionBatch:
+        def stack(name: str) -> Tensor | None:
+            return torch.stack([item[name] for item in items]) if name in items[0] else None
+
+        images, state, text = (torch.stack([item[name] for item in items]) for name in ("images", "state", "text"))
+        history = stack_history([item["history"] for item in items]) if "history" in items[0] else None
+        return DiffusionBatch(images, state, text, stack("actions"), stack("action_mask"), history)
+
+    # Folders
+
+    def to_config(self) -> dict[str, Any]:
+        return {
+            "name": "diffusion_policy",
+            "picture": list(self.picture),
+            "text": self.text_name,
+            "text_dim": self.text.width,
+            "window": self.samples.window,
+            "frames": FRAMES[0] if self.samples.consecutive else FRAMES[1],
+            "memory_size": self.memory_size,
+            "embodiment": self.embodiment.to_dict(),
+            "stats": None if self.stats is None else STATS_FILE,
+        }
+
+    @classmethod
+    def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
+        """Read what `save` wrote.
+
+        Args:
+            folder: of a checkpoint, which may be untrusted.
+            tokenizer: the folder of a CLIP, in place of what `processor.json` names.
+        """
+        return load_with_goal_encoder(cls, "diffusion_policy", Path(folder), tokenizer, trusted=(CLIP_NAME, HASHED))

@@ -1,0 +1,98 @@
+"""Sizes of a Prismatic VLM (two vision towers, a projector, Llama), and of OpenVLA-OFT around it."""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from mme_vla.backbone.config import check_positive
+from mme_vla.errors import UserError
+
+
+@dataclass(frozen=True)
+class TowerConfig:
+    """One vision transformer; its tokens after the block before the last are read, so it has two blocks at least."""
+
+    width: int
+    depth: int
+    mlp_dim: int
+    num_heads: int
+
+    def __post_init__(self) -> None:
+        check_positive(self, "a vision tower's ")
+        if self.depth < 2:
+            raise UserError(f"A vision tower of depth={self.depth} has no block before its last: at least 2.")
+        if self.width % self.num_heads:
+            raise UserError(f"A vision tower's width={self.width} must be a multiple of num_heads={self.num_heads}.")
+
+
+@dataclass(frozen=True)
+class FusedVisionConfig:
+    """DINOv2 and SigLIP on the same patches. `image_size` must be a multiple of `patch_size`."""
+
+    image_size: int = 224
+    patch_size: int = 14
+    dino: TowerConfig = field(default_factory=lambda: TowerConfig(1024, 24, 4096, 16))
+    siglip: TowerConfig = field(default_factory=lambda: TowerConfig(1152, 27, 4304, 16))
+
+    def __post_init__(self) -> None:
+        for name, value in (("image_size", self.image_size), ("patch_size", self.patch_size)):
+            if value < 1:
+                raise UserError(f"vision.{name}={value} must be at least 1.")
+        if self.image_size % self.patch_size:
+            raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
+
+    @property
+    def width(self) -> int:
+        """Width of a fused token: both towers' side by side."""
+        return self.dino.width + self.siglip.width
+
+    @property
+    def grid(self) -> int:
+        """Side of an image's token grid."""
+        return self.image_size // self.patch_size
+
+
+@dataclass(frozen=True)
+class LlamaConfig:
+    """A Llama without grouped keys.
+
+    norm_eps: OpenVLA's published configuration leaves it at the class's default of 1e-6, although Llama 2 itself has
+    1e-5; OpenVLA-OFT trained and tests with that.
+    """
+
+    width: int = 4096
+    mlp_dim: int = 11008
+    depth: int = 32
+    num_heads: int = 32
+    norm_eps: float = 1e-6
+
+    def __post_init__(self) -> None:
+        check_positive(self, "vlm.")
+        if self.width % (2 * self.num_heads):
+            raise UserError(f"vlm.width={self.width} must be a multiple of 2 · num_heads={self.num_heads}.")
+
+
+@dataclass(frozen=True)
+class OpenVlaConfig:
+    """OpenVLA-OFT: the VLM, a token of the state, and a head that reads a chunk off zeroed slots.
+
+    state_dim: numbers of the state that the network reads; 0 for none. end_id: the token that closes the sequence.
+    """
+
+    everything_sees_everything: ClassVar[bool] = True
+
+    vision: FusedVisionConfig = field(default_factory=FusedVisionConfig)
+    vlm: LlamaConfig = field(default_factory=LlamaConfig)
+    vocab_size: int = 32_064
+    end_id: int = 2
+    action_dim: int = 8
+    state_dim: int = 8
+    horizon: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("vocab_size", "end_id", "action_dim", "horizon"):
+            if getattr(self, name) < 1:
+                raise UserError(f"backbone.{name}={getattr(self, name)} must be at least 1.")
+        if self.state_dim < 0:
+            raise UserError(f"backbone.state_dim={self.state_dim} must be at least 0.")
+        if self.end_id >= self.vocab_size:
+            raise UserError(f"backbone.end_id={self.end_id} is no token of vocab_size={self.vocab_size}.")

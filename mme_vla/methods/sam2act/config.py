@@ -1,0 +1,116 @@
+"""Sizes of SAM2Act+: the defaults are the released model's."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, brief
+from mme_vla.methods.sam2act.geometry import VIEWS
+
+LEVELS = 4
+"""Stages of the encoder, each half as fine as the one before."""
+LARGEST = 2**16
+
+
+@dataclass(frozen=True)
+class EncoderSizes:
+    """SAM2's image encoder (Hiera and its neck); Hiera-B+ by default.
+
+    width, heads: of the first stage; both double from stage to stage. blocks, windows: number of blocks and side of the
+    attention windows, of each stage. global_blocks: blocks, counted through all stages, that attend to the whole image.
+    background: side of the table of positions. neck: width of its output maps. lora: rank of the adapters.
+    """
+
+    width: int = 112
+    heads: int = 2
+    blocks: tuple[int, ...] = (2, 3, 16, 3)
+    windows: tuple[int, ...] = (8, 4, 14, 7)
+    global_blocks: tuple[int, ...] = (12, 16, 20)
+    background: int = 14
+    neck: int = 256
+    lora: int = 16
+
+    def __post_init__(self) -> None:
+        _check_sizes(self, "backbone.encoder")
+        for name in ("blocks", "windows"):
+            if len(getattr(self, name)) != LEVELS:
+                raise UserError(f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage.")
+        if any(place >= sum(self.blocks) for place in self.global_blocks):
+            raise UserError(f"backbone.encoder.global_blocks={list(self.global_blocks)}: there are {sum(self.blocks)}.")
+
+    @property
+    def widths(self) -> list[int]:
+        """Width of each stage."""
+        return [self.width * 2**stage for stage in range(LEVELS)]
+
+
+@dataclass(frozen=True)
+class SAM2ActSizes:
+    """The network: both looks have the same sizes.
+
+    grid, patch: patches of a virtual image, and their side in pixels; an image has grid · patch of them.
+    width, heads, depth: of the multi-view transformer. language, words: width and number of the goal's tokens.
+    sam, images, state: what of a token's width the encoder's map, the image and the robot's state take.
+    state_dim: numbers of the robot's state. rotation_bins: of a whole turn. head: first width of the heads.
+    memory: width of a remembered place; memory_layers, memory_feedforward: of the attention over memories.
+    mask_stages: halvings between a heatmap's image and the grid. remembered: most keyframes that are read.
+    """
+
+    encoder: EncoderSizes = field(default_factory=EncoderSizes)
+    grid: int = 16
+    patch: int = 14
+    width: int = 512
+    heads: int = 8
+    depth: int = 8
+    language: int = 512
+    words: int = 77
+    sam: int = 48
+    pictures: int = 48
+    state: int = 32
+    state_dim: int = 4
+    rotation_bins: int = 72
+    head: int = 256
+    memory: int = 64
+    memory_layers: int = 4
+    memory_feedforward: int = 2048
+    mask_stages: int = 4
+    remembered: int = 9
+
+    @classmethod
+    def from_dict(cls, section: Mapping[str, Any]) -> Self:
+        """Read the section `backbone` of a configuration, but for its `name`."""
+        return read_section(cls, {key: value for key, value in section.items() if key != "name"}, "backbone")
+
+    def __post_init__(self) -> None:
+        _check_sizes(self, "backbone")
+        if self.width % self.heads:
+            raise UserError(f"backbone.width={self.width} must be a multiple of backbone.heads={self.heads}.")
+        if self.depth % 2:
+            raise UserError(f"backbone.depth={self.depth} must be even: half of the layers see one view alone.")
+        if self.token % 4 or self.memory % 4:
+            raise UserError(f"Tokens ({self.token}) and memories ({self.memory}) need widths that are multiples of 4.")
+        if 360 % self.rotation_bins:
+            raise UserError(f"backbone.rotation_bins={self.rotation_bins} must divide a turn of 360 degrees.")
+
+    @property
+    def side(self) -> int:
+        """Side of a virtual image in pixels."""
+        return self.grid * self.patch
+
+    @property
+    def token(self) -> int:
+        """Width of a patch's token outside the transformer."""
+        return self.sam + self.pictures + self.state
+
+    @property
+    def feature(self) -> int:
+        """Width of what the heads read."""
+        return 2 * VIEWS * self.token
+
+
+def _check_sizes(sizes: Any, where: str) -> None:
+    for name, value in vars(sizes).items():
+        for number in value if isinstance(value, tuple) else [value]:
+            if isinstance(number, int) and not 1 <= number <= LARGEST:
+                raise UserError(f"{where}.{name}={brief(value)}: sizes are whole numbers from 1 to {LARGEST}.")

@@ -1,0 +1,160 @@
+"""`MMEModel`: a backbone, a memory and an integration as one network. Read this file first.
+
+    images, prompt ── backbone.embed ──► blocks ─┐
+    history ───────── memory ──────────► tokens ─┴─► integration.inject ──► Injection
+    Injection, noise ─ backbone.loss or backbone.sample ──► loss [b, h] or chunk [b, h, a]
+
+Data flows down once. The backbone does not call the integration, and neither knows which memory made the tokens. It
+needs torch, numpy, einops and timm; configuration, datasets and simulation are in other packages.
+
+    backbone/   base.py (interface) · pi05.py · gemma.py (joint experts, KV cache) · siglip.py · attention.py · flow.py
+    memory/     base.py (interface) · history.py (stored tokens of an episode) · encoder.py · framesamp.py · …
+    integration/ base.py (interface) · context.py · modulator.py · expert.py
+
+Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.base import Backbone, Injection
+from mme_vla.integration.base import Integration
+from mme_vla.memory.base import MemoryModule
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise
+
+
+class MMEModel(nn.Module):
+    """One composition of backbone, memory and integration.
+
+    Args:
+        backbone: constructed with `integration.extra_experts()`.
+        memory: None for the policy without memory. integration: the base class `Integration` adds nothing.
+        compute_dtype: bfloat16 runs matrix products under autocast over float32 weights.
+
+    >>> sizes = BackboneConfig()  # doctest: +SKIP
+    >>> integration = Modulator(sizes)  # doctest: +SKIP
+    >>> backbone = Pi05Backbone(sizes, integration.extra_experts())  # doctest: +SKIP
+    >>> memory = FrameSamp(backbone.vision_width, integration.memory_width)  # doctest: +SKIP
+    >>> model = MMEModel(backbone, memory, integration)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        backbone: Backbone,
+        memory: MemoryModule | None,
+        integration: Integration,
+        compute_dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        self.backbone, self.memory, self.integration = backbone, memory, integration
+        self.compute_dtype = compute_dtype
+
+    def loss(
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        memory: MemoryTokens | None = None,
+        augmentation: Tensor | None = None,
+    ) -> Tensor:
+        """The mean loss of a batch.
+
+        Args:
+            batch: with `actions`, on the model's device. noise: as `training_noise` makes it, on that device.
+            memory: memory tokens; by default those of `batch.history`.
+            augmentation: random numbers [b, …] of the image augmentation; None leaves images as they are.
+        """
+        batch = self.prepare_images(batch, augmentation)
+        with self.autocast():
+            memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
+        return masked_mean(losses, batch.action_mask)
+
+    @torch.no_grad()
+    def sample(
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
+        """A normalised chunk [b, h, a].
+
+        Args:
+            noise: as `sampling_noise` makes it, with a batch axis, on the batch's device.
+            steps: of an iterative sampler, such as Euler steps of a flow; None is the backbone's default.
+            memory: memory tokens; by default those of `batch.history`.
+        """
+        with self.autocast():
+            memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
+            batch = self.prepare_images(batch)
+            return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
+
+    # The steps, in order
+
+    def conditioned_history(self, batch: Batch) -> HistoryTokens | None:
+        """The batch's selection as the backbone reads it with the prompt."""
+        if self.memory is None or batch.history is None:
+            return None
+        condition = partial(self.backbone.condition_on_prompt, prompt=batch.prompt, prompt_mask=batch.prompt_mask)
+        return self.memory.condition_on_prompt(batch.history, condition)
+
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """Memory tokens of a selection, or None without memory."""
+        return None if self.memory is None or history is None else self.memory(history)
+
+    def prepare_images(self, batch: Batch, augmentation: Tensor | None = None) -> Batch:
+        """The batch with its views, past ones included, in [−1, 1] float32. Past views change as the current ones do.
+
+        Args:
+            batch: images uint8. augmentation: random numbers [b, …] of the image augmentation.
+        """
+        past = batch.past
+        if past is not None:
+            count = past.images.shape[1]
+            repeated = None if augmentation is None else augmentation.repeat_interleave(count, 0)
+            images = self.transform_images(past.images.flatten(0, 1), repeated).unflatten(0, (-1, count))
+            past = replace(past, images=images)
+        return replace(batch, images=self.transform_images(batch.images, augmentation), past=past)
+
+    def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
+        """Views [b, v, 3, s, s] uint8 → float32 in [−1, 1]; subclasses augment them."""
+        return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
+
+    def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
+        """The observation's blocks with memory added. The batch's images are prepared."""
+        return self.integration.inject(self.backbone.embed(batch), memory)
+
+    # Noise, device, precision
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """The random numbers for the losses of `count` samples, on the CPU; of π0.5 `noise` [n, h, a], `time` [n]."""
+        return self.backbone.training_noise(count, generator)
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """The random numbers for one chunk, on the CPU, without a batch axis; of π0.5 the starting `noise` [h, a]."""
+        return self.backbone.sampling_noise(generator)
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def autocast(self) -> torch.autocast:
+        """The autocast context of all network code."""
+        kind = self.device.type if self.device.type != "meta" else "cpu"
+        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+
+def masked_mean(losses: Tensor, counted: Tensor | None) -> Tensor:
+    """The mean of losses [b, h], over the counted steps of each sample first, so that it is independent of the batch.
+
+    Args:
+        counted: [b, h] bool; None counts all (`data.mask_padding`).
+    """
+    if counted is None:
+        return losses.mean()
+    weights = counted.to(losses.dtype)
+    return ((losses * weights).sum(1) / weights.sum(1).clamp(min=1)).mean()

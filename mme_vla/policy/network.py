@@ -1,0 +1,143 @@
+"""`NetworkPolicy`: what policies of one network share: precision, memory tokens and stored frames."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule, StreamingMemory, encode_histories
+from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.tensor_files import dtype_of
+from mme_vla.processing.base import HasMemoryImages
+from mme_vla.speed import Recomputes, Sharded
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+if TYPE_CHECKING:
+    from mme_vla.processing.base import PolicyProcessor
+
+
+class MemoryTower(NamedTuple):
+    """The vision tower whose tokens a memory stores.
+
+    pooled_tokens: images as the tower takes them, side of the grid, pooling → tokens [n, grid², width].
+    settings: what else its tokens depend on, for the fingerprint.
+    """
+
+    tower: nn.Module
+    pooled_tokens: Callable[[Tensor, int, str], Tensor]
+    width: int
+    settings: Sequence[str] = ()
+
+
+class NetworkPolicy(Policy, Recomputes, Sharded):
+    """A policy of one network.
+
+    A subclass sets its modules and `memory`, and implements `memory_tower` if it has a memory, `processor_sizes`, and
+    what `Policy` requires.
+    """
+
+    acts_in_bfloat16: ClassVar[bool] = False
+    """Whether `dtype="auto"` rounds its weights to bfloat16 on a GPU."""
+
+    def __init__(
+        self,
+        processor: "PolicyProcessor | None" = None,
+        config: Mapping[str, Any] | None = None,
+        *,
+        compute_dtype: str = "float32",
+        history_dtype: str = "bfloat16",
+        augment: bool = True,
+    ) -> None:
+        """Keep the settings.
+
+        Args:
+            processor: needed for episodes and data; the network alone runs on batches without it.
+            config: what `from_config` was given; saved with the weights.
+            compute_dtype: `bfloat16` runs matrix products under autocast over the float32 master weights.
+            history_dtype: dtype of stored vision tokens; bfloat16 as released.
+            augment: augment the current views while training.
+        """
+        super().__init__()
+        self.processor, self.config, self.augment = processor, dict(config or {}), augment
+        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
+        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
+
+    def autocast(self) -> torch.autocast:
+        """The context all network code runs in."""
+        kind = self.device.type if self.device.type != "meta" else "cpu"
+        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
+        """Size → its value in the processor and in the network; a checkpoint in which they differ is damaged."""
+        return {}
+
+    # Memory
+
+    @property
+    def memory_tower(self) -> MemoryTower:
+        """The tower of the stored vision tokens."""
+        raise NotImplementedError
+
+    def require_memory(self) -> MemoryModule:
+        """Return the memory, or raise a `UserError`."""
+        if self.memory is None:
+            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+        return self.memory
+
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """Encode selections into memory tokens; None without memory or selections."""
+        if self.memory is None or history is None:
+            return None
+        with self.autocast():
+            return self.memory(history)
+
+    @torch.no_grad()
+    def encode_memories(self, episodes: Sequence[Episode]) -> MemoryTokens | None:
+        """Encode the histories of running episodes, with their streams; None without memory."""
+        if self.memory is None:
+            return None
+        with self.autocast():
+            histories, streams = [e.required_history() for e in episodes], [e.stream for e in episodes]
+            return encode_histories(self.memory, histories, streams)
+
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        """Read a piece of what the next memory tokens need; return whether more remain."""
+        if not isinstance(self.memory, StreamingMemory) or not episode.n_observed_frames:
+            return False
+        with self.autocast():
+            return self.memory.prepare(episode.required_history(), episode.stream)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """Frames that the memory reads; without memory, any."""
+        return None if self.memory is None else self.memory.frames_read(steps, exec_start)
+
+    @torch.no_grad()
+    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
+        """Encode memory-view frames [n, H, W, 3] uint8 into stored tokens [n, grid², d_vision]."""
+        storage, source, device = self.require_memory().storage, self.memory_tower, self.device
+        processor = self.require_processor()
+        assert isinstance(processor, HasMemoryImages)
+        empty = torch.zeros(0, storage.grid**2, source.width, dtype=self.history_dtype, device=device)
+        encoded = [empty]
+        for start in range(0, len(frames), batch_size):
+            images = processor.memory_images(frames[start : start + batch_size], device=device)
+            with self.autocast():
+                encoded.append(source.pooled_tokens(images, storage.grid, storage.pooling).to(empty))
+        return torch.cat(encoded)
+
+    def vision_fingerprint(self) -> str:
+        """Hash the memory's vision tower, its dtype and the settings that a cache of its tokens depends on."""
+        source = self.memory_tower
+        digest = hashlib.sha256(str(self.compute_dtype).encode())
+        for name, tensor in sorted(source.tower.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
+        for setting in filter(None, source.settings):
+            digest.update(setting.encode())
+        return digest.hexdigest()

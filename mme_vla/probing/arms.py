@@ -1,0 +1,169 @@
+"""Arms of a probe: interventions alone or together (`drop:2`, `nodemo+shuffle`)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError, brief
+from mme_vla.evaluation.feed import Feed
+from mme_vla.policy.base import Policy
+from mme_vla.probing.channels import Channel, NoChannel, Remembered
+from mme_vla.probing.interventions import NEEDS, Intervention, Moment
+from mme_vla.registry import INTERVENTIONS
+
+DEFAULT_ARMS = (
+    "drop:all", "nodemo", "swap", "shuffle", "recent", "oracle", "delay:16", "delay:64", "delay:256", "pause",
+    "distract:1", "distract:3", "subgoal_swap", "subgoal_delay", "subgoal_count",
+)  # fmt: skip
+"""The default arms, as far as the policy and the data allow them."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Interventions that act together, in this order, under one name."""
+
+    name: str
+    parts: tuple[Intervention, ...] = ()
+
+    @property
+    def feed(self) -> Feed:
+        """What the policy observes."""
+        feed = Feed()
+        for part in self.parts:
+            feed = part.feed(feed)
+        return feed
+
+    @property
+    def needs(self) -> frozenset[str]:
+        return frozenset().union(*(part.needs for part in self.parts))
+
+    @property
+    def edits(self) -> bool:
+        """Whether the memory is changed, and not only frames or subgoals."""
+        return "entries" in self.needs
+
+    def only(self, moment: Moment) -> np.ndarray | None:
+        """The frames that may be remembered; of several such interventions those that all of them allow."""
+        allowed = [frames for part in self.parts if (frames := part.only(moment)) is not None]
+        if not allowed:
+            return None
+        both = allowed[0]
+        for frames in allowed[1:]:
+            both = np.intersect1d(both, frames)
+        if not len(both):
+            raise UserError(f"{self.name} leaves no frame to remember: its parts allow different ones.")
+        return both
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        """What is remembered instead."""
+        for part in self.parts:
+            store = part.edit(store, moment)
+        return store
+
+    def say(self, subgoal: str | None, moment: Moment) -> str | None:
+        """The subgoal that the policy reads instead."""
+        for part in self.parts:
+            subgoal = part.say(subgoal, moment)
+        return subgoal
+
+    def dial(self) -> float | None:
+        """Where the arm stands on its dial, if it is one intervention with a number for one."""
+        if len(self.parts) != 1 or self.parts[0].dial is None:
+            return None
+        value = getattr(self.parts[0], self.parts[0].dial)
+        return float(value) if isinstance(value, int | float) else None
+
+
+UNPROBED = Arm("unprobed")
+
+
+def read_arm(spec: Any) -> Arm:
+    """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`."""
+    if isinstance(spec, Mapping):
+        part: Intervention = INTERVENTIONS.build(spec)
+        options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
+        return Arm(f"{spec['name']}({options})" if options else str(spec["name"]), (part,))
+    if not isinstance(spec, str) or not spec:
+        raise UserError(f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop, …}}.")
+    return Arm(spec, tuple(_read_part(word) for word in spec.split("+")))
+
+
+def _read_part(word: str) -> Intervention:
+    name, _, value = word.partition(":")
+    entry = INTERVENTIONS[name]
+    if not value:
+        built: Intervention = INTERVENTIONS.build({"name": name})
+        return built
+    if entry.dial is None:
+        raise UserError(f"{word!r}: the intervention {name} has no dial; write {name}.")
+    number = value.removeprefix("-")
+    if value != "all" and not number.isdecimal():
+        raise UserError(f"{word!r}: the dial {entry.dial} of {name} is a whole number, or all where it counts.")
+    made: Intervention = INTERVENTIONS.build({"name": name, entry.dial: None if value == "all" else int(value)})
+    return made
+
+
+def read_arms(specs: Any) -> list[Arm]:
+    """Arms of `with`, each once."""
+    words = [specs] if isinstance(specs, str | Mapping) else list(specs)
+    arms = [read_arm(word) for word in words]
+    names = [arm.name for arm in arms]
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise UserError(f"with= names {twice[0]} twice.")
+    return arms
+
+
+def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool) -> str | None:
+    """What an arm needs and lacks, for a message; None where it can be probed.
+
+    Args:
+        recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
+    """
+    robot = policy.embodiment
+    there = {
+        "entries": not isinstance(channel, NoChannel),
+        "choice": channel.chooses,
+        "clock": channel.clock is not None,
+        "pauses": channel.sees_pauses,
+        "subgoal": policy.require_processor().prompt_spec.reads_subgoal,
+        "recordings": recordings > 0 and not robot.readings,
+        "boundaries": boundaries,
+    }
+    for need in sorted(arm.needs):
+        if not there.get(need, False):
+            return NEEDS.get(need, need)
+    if arm.feed.sessions > recordings:
+        return f"{arm.feed.sessions} recorded episodes to take from, and there are {recordings}"
+    return None
+
+
+def choose_arms(
+    specs: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
+) -> tuple[list[Arm], list[str]]:
+    """The arms of `specs`; by default those of `DEFAULT_ARMS` that policy and data allow, and why not the others."""
+    arms, left_out = [], []
+    for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
+        why = lacking(arm, policy, channel, recordings, boundaries=boundaries)
+        if why is None:
+            arms.append(arm)
+        elif specs is None:
+            left_out.append(f"{arm.name} was left out: it needs {why}.")
+        else:
+            raise UserError(f"with={arm.name} needs {why}; {policy.config.get('name', 'this policy')} has none here.")
+    return arms, left_out
+
+
+def options_of(arm: Arm) -> list[dict[str, Any]]:
+    """The options of an arm's parts, as plain values."""
+    options: list[dict[str, Any]] = []
+    for part in arm.parts:
+        names: list[str] = [option.name for option in fields(part)] if is_dataclass(part) else []
+        options.append({"intervention": type(part).__name__, **{name: getattr(part, name) for name in names}})
+    return options
+
+
+def slug(name: str) -> str:
+    """An arm's name as a folder's."""
+    return "".join(c if c.isalnum() or c in "-_+" else "-" for c in name)

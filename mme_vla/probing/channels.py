@@ -1,0 +1,282 @@
+"""Where each kind of policy keeps its memory, and how to sample chunks with other entries.
+
+No network is changed: a channel gives the policy other entries in place of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.memory.base import stack_history
+from mme_vla.memory.history import FrameScores, History
+from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import WritableMemory, with_vision_memory
+from mme_vla.policy.episode import Episode
+from mme_vla.types import HistoryTokens
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry of a memory: a frame's tokens, a row of a bank.
+
+    time: in frames that the policy observed (in chunks, for banks that count those). content: what it holds; only the
+    channel it came from can read it.
+    """
+
+    time: int
+    content: Any
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """The entries of one store, in the order they are read; None where an intervention took one away.
+
+    now: the current time, on the clock of the entries' times. name: which store, for policies that have several.
+    """
+
+    entries: tuple[Entry | None, ...]
+    now: int
+    name: str = "memory"
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    @property
+    def occupied(self) -> list[int]:
+        """Slots that hold something."""
+        return [slot for slot, entry in enumerate(self.entries) if entry is not None]
+
+    def age(self, slot: int) -> int:
+        """How long ago an entry was; 0 for a slot that holds nothing."""
+        entry = self.entries[slot]
+        return 0 if entry is None else self.now - entry.time
+
+    def without(self, slots: Sequence[int]) -> "Remembered":
+        """The same with these slots empty."""
+        gone = set(slots)
+        return replace(self, entries=tuple(None if i in gone else entry for i, entry in enumerate(self.entries)))
+
+    def rearranged(self, slots: Sequence[int], contents: Sequence[Any]) -> "Remembered":
+        """The same with other contents at these slots; times stay."""
+        new = list(self.entries)
+        for slot, content in zip(slots, contents, strict=True):
+            entry = new[slot]
+            if entry is not None:
+                new[slot] = replace(entry, content=content)
+        return replace(self, entries=tuple(new))
+
+    def changed(self, other: "Remembered") -> list[int]:
+        """Ages of the entries that are otherwise in `other`: taken away, of another content, or at another time."""
+        pairs = enumerate(zip(self.entries, other.entries, strict=True))
+        return [self.age(slot) for slot, (mine, its) in pairs if mine is not its and mine is not None]
+
+
+def same_progress(slots: Sequence[int], count: int) -> np.ndarray:
+    """For each of some slots in a row, the slot of another store of `count` entries that stands as far along."""
+    return np.linspace(0, max(count - 1, 0), max(len(slots), 1)).round().astype(int)[: len(slots)]
+
+
+Place = tuple[History, int]
+"""A frame of a history."""
+
+
+class OnlyFrames(History):
+    """A history in which some stored frames follow one another as if there had been no others.
+
+    What the memory then chooses is a choice among these; `frames` says which frame each of its numbers means.
+    """
+
+    def __init__(self, full: History, frames: np.ndarray) -> None:
+        """Take the stored frames `frames` [m], ascending, at least one; the last means the current one."""
+        every = full.spec.keep_every
+        self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
+        self._kept = full.spec.stored_frames(self._length)
+        self.frames = dict(zip(self._kept.tolist(), frames.tolist(), strict=True))
+        earlier = int((frames < full.exec_start).sum())
+        super().__init__(full.spec, int(self._kept[earlier]) if earlier < len(frames) else self._length)
+        self._whole = full
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def scores(self) -> FrameScores:
+        rows = {frame: i for i, frame in enumerate(self._whole.scores.frames.tolist())}
+        # The first frame is remembered whatever its score, as that of an episode is.
+        pairs = [(mine, rows[its]) for mine, its in self.frames.items() if mine and its in rows]
+        values = self._whole.scores.values[[row for _, row in pairs]]
+        return FrameScores(np.array([mine for mine, _ in pairs], np.int64), values)
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        its = np.array([self.frames[frame] for frame in indices[:, 0].tolist()], np.int64)
+        return self._whole.gather(np.stack([its, indices[:, 1]], axis=1))
+
+
+class Exchanged(History):
+    """A history whose frames hold what other frames held, of this episode or another."""
+
+    def __init__(self, full: History, places: Mapping[int, Place]) -> None:
+        super().__init__(full.spec, full.exec_start)
+        self._whole, self._places = full, places
+
+    def __len__(self) -> int:
+        return len(self._whole)
+
+    @property
+    def scores(self) -> FrameScores:
+        return self._whole.scores
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        parts = []
+        for frame, patch in indices.tolist():
+            history, its = self._places.get(frame, (self._whole, frame))
+            parts.append((history, [its, patch]))
+        rows: list[Tensor | None] = [None] * len(parts)
+        for history in dict.fromkeys(history for history, _ in parts):
+            at = [i for i, (source, _) in enumerate(parts) if source is history]
+            tokens = history.gather(np.array([parts[i][1] for i in at], np.int64))
+            for i, row in zip(at, tokens, strict=True):
+                rows[i] = row
+        present = [row for row in rows if row is not None]
+        return torch.stack(present) if present else self._whole.gather(indices)
+
+
+@dataclass(frozen=True)
+class MemorySnapshot:
+    """An episode's memory now: its stores, and what the channel needs to write them back."""
+
+    stores: tuple[Remembered, ...]
+    source: Any = None
+
+
+class Channel:
+    """One way to what a policy remembers. `clock`: what the times of its entries count; None where they have none."""
+
+    clock: str | None = "frames"
+    sees_pauses = True
+    """Whether frames at which nothing is decided reach this memory."""
+    chooses = True
+    """Whether the memory chooses among frames, so that it can be given fewer."""
+
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        """What is remembered at `step` (by default now), choosing among the frames `only` where they are given."""
+        raise NotImplementedError
+
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
+        """What `answer` takes for an episode that remembers `stores` instead."""
+        raise NotImplementedError
+
+    def predict_chunk(
+        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """Normalised chunks [n, h, a] for what `observation` saw of n episodes, through what `as_if` made of them."""
+        raise NotImplementedError
+
+    def commit(self, episode: Episode, remembering: Any) -> None:
+        """Let the real episode continue from a chunk that was chosen so."""
+
+
+class SelectionChannel(Channel):
+    """Memories that choose stored tokens (`Memory.select`): perceptual, recurrent and joined ones; an entry is a frame.
+
+    They may stand behind any network whose batch has a `history`.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy, self._memory = policy, with_vision_memory(policy).require_memory()
+
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        full = episode.required_history()
+        now = len(full) - 1 if step is None else step
+        if only is not None and step is not None:
+            raise ValueError("Choosing among some frames is for the current one.")
+        view: History = full if only is None else OnlyFrames(full, only)
+        at = now if only is None else len(view) - 1
+        names = view.frames if isinstance(view, OnlyFrames) else {}
+        frames = np.unique(self._memory.select(view, at)[:, 0]).tolist()
+        entries = tuple(Entry(names.get(frame, frame), (view, frame)) for frame in frames)
+        return MemorySnapshot((Remembered(entries, now),), (view, at, frames))
+
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> HistoryTokens:
+        view, at, frames = snapshot.source
+        slots = dict(zip(frames, stores[0].entries, strict=True))
+        places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
+        tokens = self._memory.gather_selection(Exchanged(view, places), at)
+        positions, mask = tokens.positions.clone(), tokens.mask.clone()
+        for frame, entry in slots.items():
+            its = tokens.mask & (tokens.positions[:, 0] == frame)
+            positions[its, 0] = 0.0 if entry is None else float(entry.time)
+            mask[its] = entry is not None
+        mask_3d = mask[:, None]
+        return HistoryTokens(
+            tokens.features.masked_fill(~mask_3d, 0), positions.masked_fill(~mask_3d, 0), mask, tokens.step
+        )
+
+    def predict_chunk(
+        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        batch = replace(batch, history=stack_history(remembering, self._policy.device))
+        return self._policy.sample_actions(batch, draws, steps)
+
+
+class WritableChannel(Channel):
+    """Episodes that write a memory of their own (`policy/episode.py`), where chunks are chosen."""
+
+    sees_pauses, chooses = False, False
+
+    def __init__(self, policy: Policy, clock: str | None) -> None:
+        self._policy, self.clock = policy, clock
+
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        assert isinstance(episode, WritableMemory)
+        stores = [
+            Remembered(tuple(Entry(time, content) for time, content in store.entries), store.now, store.name)
+            for store in episode.writable_memory()
+        ]
+        return MemorySnapshot(tuple(stores))
+
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
+        assert isinstance(episode, WritableMemory)
+        entries = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
+        return episode.with_entries(entries)
+
+    def predict_chunk(
+        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        return self._policy.predict_chunk(batch, remembering, draws, steps)
+
+    def commit(self, episode: Episode, remembering: Any) -> None:
+        assert isinstance(episode, WritableMemory)
+        episode.resume_from(remembering)
+
+
+class NoChannel(Channel):
+    """A policy without a memory that a probe can reach: its frames and its subgoal can be changed."""
+
+    clock, chooses = None, False
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        return MemorySnapshot(())
+
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Episode:
+        return episode
+
+    def predict_chunk(
+        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        return self._policy.predict_chunk(batch, remembering, draws, steps)
+
+
+def channel_of(policy: Policy) -> Channel:
+    """The way to what this policy remembers."""
+    if policy.memory is not None:
+        return SelectionChannel(policy)
+    episode = policy.start_episode("")
+    return WritableChannel(policy, episode.memory_clock) if isinstance(episode, WritableMemory) else NoChannel(policy)

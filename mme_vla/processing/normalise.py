@@ -1,0 +1,260 @@
+"""Normalisation of states and actions by quantiles or by extremes, and the running statistics it needs."""
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from torch import Tensor
+
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.utils import read_json
+
+EPSILON = 1e-6  # keeps a dimension that never moves finite
+BINS = 5000
+
+
+@dataclass(frozen=True)
+class QuantileStats:
+    """Mean, standard deviation, 1 % and 99 % quantile of each dimension; arrays [d] of float64.
+
+    min, max: the extremes, where they were kept; only normalisation by them needs them.
+    """
+
+    mean: np.ndarray
+    std: np.ndarray
+    q01: np.ndarray
+    q99: np.ndarray
+    min: np.ndarray | None = None
+    max: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.q01)
+
+    def bounds(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """What becomes −1 and 1: `quantiles` or `extremes`."""
+        if kind == "quantiles":
+            return self.q01, self.q99
+        if self.min is None or self.max is None:
+            raise UserError(
+                "This policy normalises by the smallest and largest values, and these statistics hold none (min, max): "
+                "compute them from its data, or give the stats.json of its own training."
+            )
+        return self.min, self.max
+
+    def to_dict(self) -> dict[str, list[float]]:
+        """Return plain lists, as `norm_stats.json` holds them."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.tolist() for name, value in values.items() if value is not None}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any], name: str = "statistics") -> Self:
+        """Read what `to_dict` writes."""
+        arrays = {}
+        for field in fields(cls):
+            if data.get(field.name) is None:
+                if field.name in ("min", "max"):
+                    continue
+                keys = listed(sorted(data))
+                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {keys}.")
+            try:
+                array = np.asarray(data[field.name], dtype=np.float64)
+            except (TypeError, ValueError, OverflowError):
+                array = np.full(1, np.nan)
+            if array.ndim != 1 or not np.isfinite(array).all():
+                raise UserError(f"{name}.{field.name} must be a list of finite numbers, got {brief(data[field.name])}.")
+            arrays[field.name] = array
+        if len({len(array) for array in arrays.values()}) > 1:
+            raise UserError(f"{name}: the lists have different lengths { {k: len(v) for k, v in arrays.items()} }.")
+        if (arrays["q99"] < arrays["q01"]).any():
+            raise UserError(f"{name}: q99 lies below q01 in a dimension; the statistics are damaged.")
+        if "min" in arrays and "max" in arrays and (arrays["max"] < arrays["min"]).any():
+            raise UserError(f"{name}: max lies below min in a dimension; the statistics are damaged.")
+        return cls(**arrays)
+
+
+@dataclass(frozen=True)
+class NormStats:
+    """Statistics of the raw states, and of the action chunks after the delta transform."""
+
+    state: QuantileStats
+    actions: QuantileStats
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the layout of openpi's `norm_stats.json`."""
+        return {"norm_stats": {"state": self.state.to_dict(), "actions": self.actions.to_dict()}}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Read the layout of openpi's `norm_stats.json`."""
+        inner = data.get("norm_stats")
+        if not isinstance(inner, dict) or not all(isinstance(inner.get(key), dict) for key in ("state", "actions")):
+            raise UserError(
+                'Normalisation statistics must look like {"norm_stats": {"state": {…}, "actions": {…}}}; '
+                f"got the keys {listed(sorted(inner if isinstance(inner, dict) else data))}."
+            )
+        return cls(**{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")})
+
+    def save(self, path: Path | str) -> None:
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        path = Path(path)
+        if not path.is_file():
+            raise UserError(f"No normalisation statistics at {path}.")
+        data = read_json(path, "normalisation statistics", limit=2**24)
+        try:
+            return cls.from_dict(data)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
+
+
+def normalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
+    """Map [q01, q99] to [-1, 1] in the first `len(stats)` dimensions of x [..., d]; the others pass.
+
+    Nothing is clipped. With `by="extremes"` it is [min, max] that is mapped.
+    """
+    low, span = _range(x, stats, by)
+    n = len(stats)
+    out = x.clone()
+    out[..., :n] = (x[..., :n] - low) / span * 2 - 1
+    return out
+
+
+def unnormalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
+    low, span = _range(x, stats, by)
+    n = len(stats)
+    out = x.clone()
+    out[..., :n] = (x[..., :n] + 1) / 2 * span + low
+    return out
+
+
+def _range(x: Tensor, stats: QuantileStats, by: str) -> tuple[Tensor, Tensor]:
+    if not x.is_floating_point():
+        raise UserError(f"Only floating-point values can be normalised, got {x.dtype}.")
+    if x.shape[-1] < len(stats):
+        raise UserError(f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}.")
+    low, high = stats.bounds(by)
+    return x.new_tensor(low), x.new_tensor(high - low + EPSILON)
+
+
+class ExactStats:
+    """Statistics of all rows at once, which it keeps: quantiles with linear interpolation, as numpy's."""
+
+    def __init__(self) -> None:
+        self._rows: list[np.ndarray] = []
+
+    def update(self, x: np.ndarray) -> None:
+        """Take rows [..., d]."""
+        self._rows.append(np.asarray(x, np.float64).reshape(-1, x.shape[-1]))
+
+    def result(self, extremes: bool = False) -> QuantileStats:
+        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
+        count = sum(map(len, self._rows))
+        if count < 2:
+            raise UserError(f"Statistics need at least two rows, got {count}.")
+        rows = np.concatenate(self._rows)
+        q01, q99 = np.quantile(rows, [0.01, 0.99], axis=0)
+        ends = (rows.min(0), rows.max(0)) if extremes else ()
+        return QuantileStats(rows.mean(0), rows.std(0), q01, q99, *ends)
+
+
+class RunningStats:
+    """Mean, deviation and quantiles of a stream too long to keep, in one pass.
+
+    Quantiles come from one histogram per dimension, laid over the range seen so far. When the range grows, every old
+    bin's count moves to the new bin that holds its left edge. A quantile q is the left edge of the first bin at which
+    the cumulative count reaches q·n. All as released, so that the same data give the same `norm_stats.json`: also that
+    a first bin whose edge lies a hair outside the new range loses its count, so quantiles are approximate.
+    """
+
+    def __init__(self, bins: int = BINS) -> None:
+        self._bins = bins
+        self._count = 0
+        empty: np.ndarray = np.zeros(0)
+        self._mean = self._square = self._low = self._high = empty  # [d]
+        self._edges = self._counts = empty  # [d, bins + 1] and [d, bins]
+
+    @property
+    def count(self) -> int:
+        """How many rows went in."""
+        return self._count
+
+    def update(self, batch: np.ndarray) -> None:
+        """Add rows [..., d]."""
+        rows = np.asarray(batch, dtype=np.float64)
+        rows = rows.reshape(-1, rows.shape[-1])
+        if not len(rows):
+            return
+        if not np.isfinite(rows).all():
+            raise UserError("Statistics need finite values, but the data contain NaN or infinity.")
+        low, high = rows.min(0), rows.max(0)
+        if self._count == 0:
+            self._mean, self._square = np.zeros((2, rows.shape[1]))
+            self._low, self._high = low, high
+            # A hair of room, so that a dimension that never moves still has bins.
+            self._edges = np.linspace(low - 1e-10, high + 1e-10, self._bins + 1, axis=1)
+            self._counts = np.zeros((rows.shape[1], self._bins))
+        elif rows.shape[1] != len(self._mean):
+            raise UserError(f"Rows of {rows.shape[1]} numbers cannot join statistics of {len(self._mean)}.")
+        elif (low < self._low).any() or (high > self._high).any():
+            self._low, self._high = np.minimum(low, self._low), np.maximum(high, self._high)
+            self._rebin()
+        self._count += len(rows)
+        weight = len(rows) / self._count
+        self._mean = self._mean + (rows.mean(0) - self._mean) * weight
+        self._square = self._square + ((rows**2).mean(0) - self._square) * weight
+        for edges, counts, column in zip(self._edges, self._counts, rows.T, strict=True):
+            counts += np.histogram(column, edges)[0]
+
+    def result(self, extremes: bool = False) -> QuantileStats:
+        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
+        if self._count < 2:
+            raise UserError(f"Statistics need at least two rows, got {self._count}.")
+        std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
+        ends = (self._low.copy(), self._high.copy()) if extremes else ()
+        return QuantileStats(self._mean.copy(), std, self._quantile(0.01), self._quantile(0.99), *ends)
+
+    def _rebin(self) -> None:
+        edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)
+        for i, (old, new) in enumerate(zip(self._edges, edges, strict=True)):
+            self._counts[i] = np.histogram(old[:-1], new, weights=self._counts[i])[0]
+        self._edges = edges
+
+    def _quantile(self, q: float) -> np.ndarray:
+        below = self._counts.cumsum(1) < q * self._count
+        return self._edges[np.arange(len(below)), below.sum(1)]
+
+
+REACH = 100  # multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits by that
+
+
+def finite_array(values: object, what: str) -> np.ndarray:
+    """`values` as float32."""
+    try:
+        array = np.asarray(values, np.float32)
+    except (TypeError, ValueError, OverflowError):
+        raise UserError(f"{what} must be numbers, got {brief(values)}.") from None
+    if not np.isfinite(array).all():
+        raise UserError(f"{what} must be finite numbers, got {brief(array[~np.isfinite(array)][:4].tolist())}.")
+    return array
+
+
+def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> None:
+    """Refuse values [..., d] that lie further from the middle than `REACH` times the widest range q01…q99.
+
+    The widest range of all dimensions counts, so that one which hardly moved in training (a gripper) may move.
+    """
+    if stats is None or values.shape[-1] != len(stats):
+        return
+    reach = REACH * max(float((stats.q99 - stats.q01).max()), 1e-3)
+    beyond = np.abs(values.astype(np.float64) - (stats.q01 + stats.q99) / 2) > reach
+    if beyond.any():
+        place = tuple(int(i) for i in np.argwhere(beyond)[0])
+        d = place[-1]
+        raise UserError(
+            f"{what} has {values[place]:.4g} for number {d + 1} of {values.shape[-1]}; in the training data it lies "
+            f"within {stats.q01[d]:.4g} and {stats.q99[d]:.4g}. Check the driver and the units (radians)."
+        )

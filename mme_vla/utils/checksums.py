@@ -1,0 +1,105 @@
+"""A checksum of every file of a folder, in the layout of `sha256sum`, which can check it as well: `sha256sum -c`."""
+
+import hashlib
+import re
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from mme_vla.errors import UserError
+from mme_vla.utils.io import inside, read_text, write_atomically
+
+SUMS = "SHA256SUMS"
+_AT_ONCE = 4  # files
+_REMEDY = "Take an earlier checkpoint or copy the file again"
+_LINE = re.compile(r"([0-9a-f]{64})  ([^\n]+)")
+
+
+def file_sum(path: Path) -> str:
+    """The SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sum_line(path: Path, name: str) -> str:
+    """The line of a list of checksums for a file that is, or will be, called `name`."""
+    return f"{file_sum(path)}  {name}\n"
+
+
+def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = False) -> None:
+    """Write `SHA256SUMS` for these files of a folder, by default for all files in it and below.
+
+    Files are read once more for it, in blocks and several at a time. With `keep`, the sums that are there of other
+    files stay.
+    """
+    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    listed = sorted(set(names) if names is not None else {name for name in files if name != SUMS})
+    table = _read_sums(folder / SUMS) if keep and (folder / SUMS).exists() else {}
+    with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
+        table |= zip(listed, pool.map(lambda name: file_sum(folder / name), listed), strict=True)
+    with write_atomically(folder / SUMS) as draft:
+        draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
+
+
+class Sums:
+    """The checksums that lie beside a folder's files, read once; each file is compared at most once.
+
+    there: whether there are any; folders written by others, or before there were sums, have none.
+    """
+
+    def __init__(self, folder: Path, name: str = SUMS, remedy: str = _REMEDY) -> None:
+        """Read the list.
+
+        Args:
+            folder: a folder that may hold the list `name`. remedy: what the user can do about a damaged file.
+        """
+        self.folder, self.name, self.remedy = folder, name, remedy
+        path = folder / name
+        self.there = path.exists() or path.is_symlink()
+        self.table = _read_sums(path) if self.there else {}
+        self._compared: set[str] = set()
+
+    def check(self, *names: str) -> None:
+        """Compare these files, each the first time it is asked about; one that is not listed is not checked."""
+        paths = {name: inside(self.folder, name) for name in names if name in self.table and name not in self._compared}
+        for path in paths.values():
+            if not path.is_file():
+                raise UserError(
+                    f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again."
+                )
+        with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
+            for (name, path), checksum in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
+                if checksum != self.table[name]:
+                    raise UserError(
+                        f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "
+                        f"{self.remedy}; if you changed it on purpose, delete {self.name}."
+                    )
+        self._compared |= set(paths)
+
+
+def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
+    """Compare files with the sums that were written beside them.
+
+    Args:
+        folder: a folder that may hold `SHA256SUMS`.
+        names: the files about to be read; by default all that are listed. Files that are not listed are not checked:
+            people add notes and cards.
+
+    Returns:
+        Whether there were sums to compare with.
+    """
+    sums = Sums(folder)
+    sums.check(*(sorted(sums.table) if names is None else names))
+    return sums.there
+
+
+def _read_sums(sums: Path) -> dict[str, str]:
+    """The table in a list of checksums: name → SHA-256."""
+    table = {}
+    for number, line in enumerate(read_text(sums, "a list of checksums").split("\n"), start=1):
+        match = _LINE.fullmatch(line)
+        if match is not None:
+            table[match[2]] = match[1]
+        elif line:
+            raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
+    return table

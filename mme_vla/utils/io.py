@@ -1,0 +1,447 @@
+"""Reads and writes files: text, JSON, lines of JSON. A damaged or missing file raises one clear error.
+
+Checks happen when a file is opened; what a reader returns is trusted from then on.
+"""
+
+import errno
+import json
+import math
+import os
+import re
+import socket
+import stat
+import types
+import uuid
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import MISSING, fields
+from functools import cache
+from pathlib import Path
+from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
+
+from mme_vla.errors import UserError, brief, listed
+
+# "errno = 28" (HDF5), "os error 28" (Rust)
+_NUMBER = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
+_NAME = re.compile(r"\bname = '([^']+)'")  # HDF5
+# NumPy counts what it could not write and does not say why.
+_SHORT_WRITE = re.compile(r"\d+ requested and \d+ written")
+_AGAIN = "and repeat the same command: what was finished is kept."
+_PERMIT = "Change the permissions of it or its folder, or choose another, and repeat the same command."
+_ADVICE = {
+    errno.ENOSPC: ("there is no room left for it", f"Free some room {_AGAIN}"),
+    errno.EDQUOT: ("your share of the disk is used up", f"Free some room {_AGAIN}"),
+    errno.EFBIG: ("it would be larger than files may be here", f"Raise that limit (see `ulimit -f`) {_AGAIN}"),
+    errno.EROFS: ("its disk can only be read", "Choose another folder, or make that one writable, and repeat."),
+    errno.EACCES: ("permission is denied", _PERMIT),
+    errno.EPERM: ("that is not permitted", _PERMIT),
+    errno.EMFILE: ("too many files are open", f"Raise that limit (`ulimit -n 4096`) {_AGAIN}"),
+    errno.ENFILE: ("the system has too many files open", f"Close other programs {_AGAIN}"),
+    errno.EIO: ("its disk does not answer", f"Look after the disk {_AGAIN}"),
+}
+
+
+def disk_trouble(error: BaseException) -> str | None:
+    """One sentence on what the disk refused and what to do; None if this error, or what caused it, is another matter.
+
+    Libraries wrap such errors in their own: the number is looked for in their texts and in what they were raised from.
+    """
+    number, place, visited = None, None, set[int]()
+    current: BaseException | None = error
+    while current is not None and id(current) not in visited:
+        visited.add(id(current))
+        number = _number(current) if number is None else number
+        place = getattr(current, "filename", None) or place
+        if place is None and number is not None and (named := _NAME.search(str(current))):
+            place = named[1]
+        current = current.__cause__ or current.__context__
+    if number is None or (place is None and number in (errno.EACCES, errno.EPERM)):  # a port, not a file
+        return None
+    reason, advice = _ADVICE[number]
+    return f"{place or Path.cwd()} cannot be written or opened: {reason} ({os.strerror(number)}). {advice}"
+
+
+def name_place(error: BaseException | None, place: Path) -> None:
+    """Note where an error of the disk happened, if it does not say: those of writing to an open file never do."""
+    if error is not None and not getattr(error, "filename", None) and _number(error) is not None:
+        error.filename = str(place)  # type: ignore[attr-defined]
+
+
+def _number(error: BaseException) -> int | None:
+    """The system's number of an error that `_ADVICE` knows."""
+    number = getattr(error, "errno", None)
+    if isinstance(number, int) and number in _ADVICE:
+        return number
+    if not isinstance(error, Exception) or isinstance(error, ValueError | TypeError | LookupError):
+        return None
+    if isinstance(error, OSError) and _SHORT_WRITE.search(str(error)):
+        return errno.ENOSPC
+    for match in _NUMBER.finditer(str(error)):
+        if int(match[1]) in _ADVICE:
+            return int(match[1])
+    return None
+
+
+def require_file(path: Path, what: str = "a file") -> Path:
+    """Return `path` if it is a regular file, which can be opened without waiting."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise UserError(f"{_short_path(path)} is missing; expected {what}.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
+    if not stat.S_ISREG(mode):
+        raise UserError(f"{_short_path(path)} is not a file; expected {what}.")
+    return path
+
+
+def _short_path(path: Path) -> str:
+    """A path in a message; an untrusted file may have given it a name of any length."""
+    return brief(str(path), 300, quote=False)
+
+
+@contextmanager
+def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
+    """Around a call into another library that parses the file `path`, and nothing else.
+
+    Parsers of binary formats raise whatever they stumble over, from KeyError to MemoryError; there is no list of it.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        message = " ".join(
+            str(error.__cause__ or error).split()
+        )  # some wrap what happened in a sentence without content
+        reason = f"{type(error).__name__}: {brief(message, 200, quote=False)}" if message else type(error).__name__
+        raise UserError(f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}") from error
+
+
+def inside(folder: Path, name: str, what: str = "file") -> Path:
+    """Return the path of `name` in `folder`, symbolic links followed.
+
+    A snapshot in the hub's cache is made of links to the files of its repository's folder, `../../blobs/…`: these count
+    as its own.
+    """
+    place, root = folder / name, folder.resolve()
+    try:
+        resolved = place.resolve()
+    except (OSError, ValueError, RuntimeError):  # a null character, a loop of links
+        resolved = Path("/")
+    within = resolved.is_relative_to(root) and resolved != root
+    linked = ".." not in Path(name).parts and any(resolved.is_relative_to(blobs) for blobs in _blobs_of(root))
+    if not name or Path(name).is_absolute() or not (within or linked):
+        raise UserError(
+            f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
+            "dataset's own folder is read for it; copy the file into the folder, or correct the name."
+        )
+    return place
+
+
+def _blobs_of(root: Path) -> list[Path]:
+    """Where the hub's cache keeps the files of the snapshot that `root` is, or lies in; nowhere for other folders."""
+    for place in (root, *root.parents):
+        repository = place.parent.parent
+        if place.parent.name == "snapshots" and _HUB_REPOSITORY.match(repository.name):
+            return [repository / "blobs"]
+    return []
+
+
+_HUB_REPOSITORY = re.compile(r"(models|datasets|spaces)--")
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
+
+
+def safe_name(name: str, what: str = "name") -> str:
+    """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most 100 characters."""
+    if not isinstance(name, str) or not _SAFE_NAME.fullmatch(name):
+        raise UserError(
+            f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -, "
+            "beginning with a letter or digit."
+        )
+    return name
+
+
+def user_cache(kind: str) -> Path:
+    """Where what can be made again is kept for this user: a folder in $MME_VLA_CACHE, else in ~/.cache/mme_vla."""
+    return Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / kind
+
+
+_KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
+
+TEXT_LIMIT = 64 * 2**20  # bytes; the largest files of text here, tables of subgoals and statistics, stay far below
+LOG_LIMIT = 2**30  # bytes of a file of lines
+
+
+def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes:
+    """Read a regular file of at most `limit` bytes."""
+    try:
+        # A pipe without a writer would block in open(); a device would never end.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        with os.fdopen(descriptor, "rb") as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise UserError(f"{path} is not a file; expected {what}.")
+            if status.st_size > limit:
+                raise UserError(f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
+            return file.read(status.st_size + 1)  # reading `limit` would allocate it, whatever the size
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist; expected {what}.") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the path
+        reason = "a folder" if isinstance(error, IsADirectoryError) else getattr(error, "strerror", None) or error
+        raise UserError(f"{path} cannot be read as {what}: {reason}.") from None
+
+
+def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
+    """Read a regular file of UTF-8 text of at most `limit` bytes; see `read_bytes`."""
+    data = read_bytes(path, what, limit)
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path} is damaged: byte {error.start:,} is not UTF-8 text; expected {what}.") from None
+
+
+def is_text(value: object) -> bool:
+    """Whether a value is text that can be written and tokenised: JSON's escapes allow half characters, UTF-8 does not.
+
+    >>> is_text("\ud800")
+    False
+    """
+    if not isinstance(value, str):
+        return False
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = dict, finite: bool = True) -> Any:
+    """Parse JSON that somebody else wrote.
+
+    Args:
+        text: the JSON.
+        source: where it came from, for the message.
+        kind: what the outermost value must be.
+        finite: whether NaN and infinities, which JSON does not have but Python writes, are refused.
+    """
+    try:
+        # Python's own constants are looked at only where they are refused: hooks slow the parser down.
+        value = json.loads(text, parse_float=_finite, parse_constant=_no_constant) if finite else json.loads(text)
+    except RecursionError:
+        raise UserError(f"{source} is nested too deeply to be JSON of this library.") from None
+    except (ValueError, OverflowError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
+        raise UserError(f"{source} is not valid JSON: {brief(str(error), 200, quote=False)}.") from None
+    if not isinstance(value, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        expected = " or ".join(_KINDS.get(k, k.__name__) for k in kinds)
+        raise UserError(f"{source} must hold {expected}, not {brief(value)}.")
+    return value
+
+
+def read_json(
+    path: Path, what: str = "JSON", kind: type | tuple[type, ...] = dict, limit: int = TEXT_LIMIT, finite: bool = True
+) -> Any:
+    """Read a file of JSON; see `read_text` and `parse_json`."""
+    return parse_json(read_text(path, what, limit), str(path), kind, finite)
+
+
+def read_lines[T](
+    path: Path,
+    kind: Callable[[dict[str, Any]], T],
+    what: str = "lines of JSON",
+    *,
+    limit: int = LOG_LIMIT,
+    finite: bool = True,
+) -> list[T]:
+    """Read a file of JSON lines, one object each: episode records, probe lines, rows, logs.
+
+    A line's `crc32` (see `with_checksum`) is verified and removed. Empty lines are skipped. A half-written last line
+    without a line end is ignored with a warning: a killed process was writing it.
+
+    Args:
+        kind: makes a value from a line's object, such as `partial(to_dataclass, EpisodeLine)`, or `dict`.
+        finite: raise an error for NaN and infinities.
+    """
+    # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
+    *complete, last = read_bytes(path, what, limit).split(b"\n")
+    values = []
+    for number, line in enumerate([*complete, last], start=1):
+        if not line.strip():
+            continue
+        source = f"{path}, line {number}"
+        try:
+            values.append(_read_line(line, kind, source, finite))
+        except UserError:
+            if number <= len(complete):
+                raise
+            warnings.warn(f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2)
+    return values
+
+
+def _read_line[T](line: bytes, kind: Callable[[dict[str, Any]], T], source: str, finite: bool) -> T:
+    row = verified(parse_json(line, source, finite=finite), source)
+    try:
+        return kind(row)
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from None
+
+
+def append_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Append objects as JSON lines, each with its checksum, in one write that is on disk when this returns."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as file:
+        file.write("".join(to_line(row) + "\n" for row in rows).encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def to_line(row: Mapping[str, Any]) -> str:
+    """An object as one JSON line with its checksum, without the line end."""
+    return json.dumps(with_checksum(row), ensure_ascii=False, separators=(",", ":"))
+
+
+def to_dataclass[T](cls: type[T], values: Mapping[str, Any]) -> T:
+    """Build a dataclass from an object of a file: every field is known, present and of the annotated type."""
+    types, members = _type_hints(cls), {member.name: member for member in fields(cls)}  # type: ignore[arg-type]
+    required = [n for n, m in members.items() if m.default is MISSING and m.default_factory is MISSING]
+    missing, unknown = sorted(set(required) - set(values)), sorted(set(values) - set(members))
+    if missing or unknown:
+        raise UserError(
+            f"not a {cls.__name__}: missing {listed(missing) or 'nothing'}, unknown {listed(unknown) or 'nothing'}."
+        )
+    for name, value in values.items():
+        if not _is_of(value, types[name]):
+            raise UserError(f"{cls.__name__}.{name}={brief(value)}: expected {_type_name(types[name])}.")
+    return cls(**values)
+
+
+@cache
+def _type_hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _type_name(expected: Any) -> str:
+    return expected.__name__ if isinstance(expected, type) and not get_args(expected) else str(expected)
+
+
+def _is_of(value: Any, expected: Any) -> bool:
+    """Whether a JSON value has a type such as `int`, `float | None` or `list[int]`; an integer is a float as well."""
+    origin, inner = get_origin(expected), get_args(expected)
+    if expected is Any:
+        return True
+    if origin in (Union, types.UnionType):
+        return any(_is_of(value, option) for option in inner)
+    if origin is list:
+        return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
+    if expected in (int, float):
+        numbers = int if expected is int else (int, float)
+        return isinstance(value, numbers) and not isinstance(value, bool) and not abs(value) >= 2**63
+    return isinstance(value, origin or expected)
+
+
+CHECKSUM = "crc32"
+
+
+def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
+    """`values` and, under `crc32`, a checksum of them that does not depend on the order of keys."""
+    return {**values, CHECKSUM: _crc(values)}
+
+
+def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """`values` without their checksum, which must fit. Values without a checksum are accepted."""
+    inner = {key: value for key, value in values.items() if key != CHECKSUM}
+    if CHECKSUM in values and values[CHECKSUM] != _crc(inner):
+        raise UserError(
+            f"{source} is not what was written: its {CHECKSUM} is {brief(values[CHECKSUM], 20)}, that of its content "
+            f"{_crc(inner)!r}. It is damaged; if you changed it on purpose, remove {CHECKSUM}."
+        )
+    return inner
+
+
+def _crc(values: Mapping[str, Any]) -> str:
+    # ASCII, so that half characters, which no encoding of text takes, count as well.
+    return f"{zlib.crc32(json.dumps(values, sort_keys=True, separators=(',', ':')).encode('ascii')):08x}"
+
+
+def to_json(value: Any) -> Any:
+    """`value` as JSON returns it: tuples are lists, keys are texts."""
+    return json.loads(json.dumps(value))
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise ValueError(f"the number {brief(text)} is out of range")
+    return value
+
+
+def _no_constant(text: str) -> NoReturn:
+    raise ValueError(f"{text} is not a number")
+
+
+_DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
+
+
+@contextmanager
+def write_atomically(path: Path) -> Iterator[Path]:
+    """Yield a draft beside `path`, which becomes `path` in one rename if the block ends well and is removed otherwise.
+
+    >>> with write_atomically(Path("plan.json")) as draft:
+    ...     draft.write_text("{}")
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = draft_of(path)
+    try:
+        yield draft
+        draft.replace(path)
+    except BaseException as error:
+        name_place(error, path)
+        draft.unlink(missing_ok=True)
+        raise
+
+
+def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
+    """Write `value` as JSON in one rename; numbers that are not finite are refused (ValueError)."""
+    with write_atomically(path) as draft:
+        draft.write_text(json.dumps(value, indent=indent, allow_nan=False) + "\n")
+
+
+def draft_of(path: Path) -> Path:
+    """Where this process writes what is to become `path`.
+
+    Machine and process are in the name, so that a killed one's can be told, and a random number, as both may repeat
+    among containers: two writers never share a draft, and the last one to finish wins whole.
+    """
+    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.partial")
+
+
+def is_draft(path: Path) -> bool:
+    """Whether this is a draft, of whichever process."""
+    return _DRAFT.fullmatch(path.name) is not None
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove the drafts in a folder whose writers, processes of this machine, were killed."""
+    for path in folder.glob(".*.partial"):
+        draft = _DRAFT.fullmatch(path.name)
+        if draft is not None and draft["host"] == _host() and not is_alive(int(draft["process"])):
+            path.unlink(missing_ok=True)
+
+
+def _host() -> str:
+    return socket.gethostname().partition(".")[0]
+
+
+def is_alive(process: int) -> bool:
+    """Whether a process of this machine runs."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's
+        return True
+    return True

@@ -1,0 +1,135 @@
+"""One process at a time in a folder, and work folders that a repeated command recognises."""
+
+import errno
+import os
+import shutil
+import socket
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from filelock import FileLock, Timeout
+
+from mme_vla.errors import UserError
+from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
+
+LOCK = ".lock"
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # errors of a file system without locks
+
+
+class FolderLock:
+    """Lock a folder for this process, as a context manager or from `acquire()` to `release()`.
+
+    The lock is a file in the folder. `release` removes it, and the folder if nothing else is in it. After a kill the
+    file stays, unlocked. A forked process does not have its parent's lock.
+    Deleting the object unlocks the folder.
+
+    Args:
+        folder: made if need be. what: its purpose, for the message. name: of the file, where several share a folder.
+    """
+
+    def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
+        self.folder, self.what, self.path = Path(folder), what, Path(folder) / name
+        self._process = os.getpid()
+        # A second attempt counts where the process before removes the file between opening and locking it.
+        self._lock = FileLock(self.path, timeout=0.1, poll_interval=0.02, thread_local=False, fallback_to_soft=False)
+
+    def acquire(self) -> Self:
+        """Lock the folder; raises an error that names the process which has locked it."""
+        for last in (False,) * 99 + (True,):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            try:
+                self._lock.acquire()
+                break
+            except FileNotFoundError:  # the process before has just removed the folder
+                if last:
+                    raise
+            except Timeout:
+                raise UserError(
+                    f"{self.folder} is in use by another {self.what} ({self._holder()}). "
+                    "Wait until it has ended, stop it, or write to another folder."
+                ) from None
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                return self
+        with suppress(OSError):  # a full disk: the lock holds without its text
+            self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
+        return self
+
+    def release(self) -> None:
+        """Unlock the folder; harmless if this process has not locked it."""
+        if os.getpid() != self._process or not self._lock.is_locked:
+            return
+        with suppress(OSError):  # the folder may have been moved or removed meanwhile
+            self.path.unlink()
+            self.folder.rmdir()
+        self._lock.release()
+
+    def _holder(self) -> str:
+        try:
+            return self.path.read_text(errors="replace")[:200].strip() or "a process that has just started"
+        except OSError:
+            return "a process that has just ended"
+
+    def __enter__(self) -> Self:
+        return self.acquire()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        name_place(error, self.folder)
+        self.release()
+
+
+PLAN = "plan.json"
+
+
+def claim_plan(folder: Path, plan: Any) -> bool:
+    """Make `folder` the work folder of a plan, or recognise it as such. The caller holds its lock.
+
+    A folder without any work is free, whatever a killed run left while it wrote its plan.
+
+    Args:
+        plan: plain JSON, an object or a list.
+
+    Returns:
+        Whether the folder is this plan's; False where it holds something else.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    record, about = folder / PLAN, "the plan of a command's work"
+    if record.exists():
+        try:
+            if read_json(record, about, kind=(dict, list)) == plan:
+                remove_drafts(folder)
+                return True
+        except UserError:
+            pass  # cut off when the machine went down: free, if there is no work yet
+        else:
+            return False
+    if any(_is_work(path) for path in folder.iterdir()):
+        return False
+    remove_drafts(folder)
+    write_json(record, plan, indent=1)
+    return True
+
+
+def drop_plan(folder: Path) -> None:
+    """Remove a plan's work folder, the plan last: a removal that was cut off is recognised, and repeated.
+
+    The caller holds the folder's lock, whose release removes the folder itself.
+    """
+    for path in folder.iterdir():
+        if path.name not in (PLAN, LOCK):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+    (folder / PLAN).unlink(missing_ok=True)
+
+
+def _is_work(path: Path) -> bool:
+    if path.name in (PLAN, LOCK) or is_draft(path):
+        return False
+    return not path.is_dir() or any(path.iterdir())

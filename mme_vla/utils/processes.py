@@ -1,0 +1,58 @@
+"""Worker processes that end with the process that started them, however that ends, and leave Ctrl-C to it."""
+
+import multiprocessing
+import os
+import resource
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import wait
+
+
+def end_with_parent() -> None:
+    """Called first in a worker: it ends as soon as its parent is gone, even a killed one, and ignores Ctrl-C.
+
+    Ctrl-C goes to every process of a terminal; the parent alone answers it, and ends its workers.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+    # The process that forked this one: the parent itself, or its fork server, which ends when the parent does.
+    watched, number = [parent.sentinel], os.getppid()
+
+    def watch() -> None:
+        # Forked sisters hold each other's ends of the pipe, so that number is looked at as well.
+        while not wait(watched, timeout=1.0) and os.getppid() == number:
+            pass
+        os._exit(1)  # nothing to tidy up for anybody, and a simulator may take long to
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()
+
+
+@contextmanager
+def signals_deferred() -> Iterator[None]:
+    """While this is open, Ctrl-C waits; processes that are started meanwhile never see it, so that they can be young.
+
+    A process that is still importing would otherwise answer with a traceback.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_OTHERS = 256  # descriptors that libraries, workers and sockets need besides
+
+
+def files_to_hold(limit: int) -> int:
+    """How many of `limit` files may be held open: all, where the system lets this process raise its own limit."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = limit + _OTHERS
+    if soft != resource.RLIM_INFINITY and soft < needed:
+        raised = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, raised), hard))
+        soft = max(soft, raised)
+    return limit if soft == resource.RLIM_INFINITY else min(limit, max(soft - _OTHERS, 8))

@@ -1,0 +1,88 @@
+"""Normalisation statistics that lie beside foreign checkpoints."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.policy.tensor_files import read_safetensors
+from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.utils import check_sums, inside, read_json
+from mme_vla.weights.source import METHOD_FORMATS
+
+_PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+_FEATURES = {"state": "observation.state", "actions": "action"}
+
+
+def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None:
+    """The statistics in a checkpoint folder, or None where it has none.
+
+    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion Policy's `stats.json`,
+    OpenVLA-OFT's `dataset_statistics.json` of one dataset, and the file that LeRobot's processor description names as
+    the state of its normaliser. LeRobot's speak of the actions it was trained on: they fit this library's joint deltas
+    if that policy used relative actions with an absolute gripper.
+
+    Args:
+        folder: the checkpoint (for released runs: the step).
+        asset: which of several datasets' statistics.
+    """
+    folder = Path(folder)
+    files = stats_files(folder)
+    if asset is not None or len(files) > 1:
+        if asset not in files:
+            raise UserError(
+                f"{folder} holds statistics of {listed(files) or 'no dataset'}: "
+                + (
+                    f"there are none of {brief(asset)}."
+                    if asset
+                    else "say which: --asset, or read_stats(folder, asset)."
+                )
+            )
+        return NormStats.load(_local_file(folder, files[asset]))
+    if files:
+        return NormStats.load(_local_file(folder, next(iter(files.values()))))
+    if (folder / "norm_stats.json").is_file():
+        return NormStats.load(_local_file(folder, folder / "norm_stats.json"))
+    for fmt in METHOD_FORMATS.values():
+        if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
+            return stats
+    return next(_lerobot_stats(folder), None)
+
+
+def stats_files(folder: Path) -> dict[str, Path]:
+    """The statistics that openpi keeps in a checkpoint, by the name of their dataset."""
+    assets = folder / "assets"
+    return {file.parent.relative_to(assets).as_posix(): file for file in sorted(assets.glob("**/norm_stats.json"))}
+
+
+def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
+    for name in _PROCESSORS:
+        if not (folder / name).is_file():
+            continue
+        steps = read_json(_local_file(folder, folder / name), "a LeRobot processor").get("steps")
+        if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+            raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
+        for file in (step["state_file"] for step in steps if step.get("state_file")):
+            if not isinstance(file, str):
+                raise UserError(f"{folder / name}: state_file={brief(file)} must be the name of a file.")
+            tensors = read_safetensors(inside(folder, file, "statistics"))
+            if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
+                yield NormStats(**{target: _quantiles(tensors, source) for target, source in _FEATURES.items()})
+
+
+def _local_file(folder: Path, file: Path) -> Path:
+    """A file of a checkpoint, which must lie in it, compared with its checksum where there is one."""
+    name = file.relative_to(folder).as_posix()
+    check_sums(folder, [name])
+    return inside(folder, name, "statistics")
+
+
+def _quantiles(tensors: Mapping[str, Tensor], feature: str) -> QuantileStats:
+    values: dict[str, Any] = {}
+    for key in ("mean", "std", "q01", "q99"):
+        tensor = tensors.get(f"{feature}.{key}")
+        values[key] = None if tensor is None else np.asarray(tensor.double().flatten()).tolist()
+    return QuantileStats.from_dict(values, feature)

@@ -1,0 +1,208 @@
+"""Name tables: how a foreign checkpoint names and lays out our tensors, written once and read in both directions.
+
+A room supplies a table for its own modules; an adapter in `weights/` applies the tables to whole checkpoints.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from einops import rearrange
+from torch import Tensor
+
+from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.errors import UserError, listed
+from mme_vla.policy.base import Policy
+from mme_vla.policy.tensor_files import check_fit
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some rows of one of our tensors, as they lie in a foreign one.
+
+    path: the foreign name.
+    pattern: einops pattern from theirs to ours; empty where they are the same.
+    axes: sizes of the pattern's grouped axes, which the way back needs.
+    layer: index in the foreign tensor's leading layer axis, if it has one.
+    """
+
+    path: str
+    pattern: str = ""
+    axes: Mapping[str, int] = field(default_factory=dict)
+    layer: int | None = None
+
+    def to_target(self, tensor: Tensor) -> Tensor:
+        if self.layer is not None:
+            tensor = tensor[self.layer].clone()  # a tensor of its own, which keeps no other layer in memory
+        return rearrange(tensor, self.pattern, **self.axes) if self.pattern else tensor
+
+    def to_source(self, tensor: Tensor) -> Tensor:
+        if not self.pattern:
+            return tensor
+        left, right = self.pattern.split("->")
+        return rearrange(tensor, f"{right} -> {left}", **self.axes)
+
+    def rows(self) -> int:
+        """How many rows of our tensor this piece fills; asked only where several pieces share one."""
+        right = self.pattern.split("->")[1].strip()
+        first = right[1:].split(")")[0] if right.startswith("(") else right.split()[0]
+        return math.prod(self.axes[axis] for axis in first.split())
+
+
+NameTable = dict[str, list[Piece]]
+"""Our parameter name → the pieces that make it, in order of rows."""
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A foreign tensor, or one layer of it, that no action reads: dropped when read, zeros when written."""
+
+    path: str
+    shape: tuple[int, ...]
+    layer: int | None = None
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A foreign tensor that follows from the configuration: recomputed, never read, and written for other readers."""
+
+    path: str
+    make: Callable[[], Tensor]
+
+
+def prefixed(prefix: str, table: NameTable) -> NameTable:
+    """Return the table of a module that sits at `prefix` in its parent."""
+    return {f"{prefix}.{name}": pieces for name, pieces in table.items()}
+
+
+def linear(path: str, *, layer: int | None = None, bias: bool = True) -> NameTable:
+    """A linear layer stored as kernel (in, out), with its bias."""
+    table: NameTable = {"weight": [Piece(f"{path}/kernel", "i o -> o i", layer=layer)]}
+    if bias:
+        table["bias"] = [Piece(f"{path}/bias", layer=layer)]
+    return table
+
+
+def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Translate a foreign checkpoint into our names and layouts."""
+    missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
+    if missing:
+        raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
+    target = {}
+    for name, pieces in table.items():
+        try:
+            parts = [piece.to_target(source[piece.path]) for piece in pieces]
+        except (RuntimeError, IndexError, ValueError) as error:
+            shapes = {piece.path: tuple(source[piece.path].shape) for piece in pieces}
+            raise UserError(f"{name} cannot be made of {shapes}: {error}") from error
+        target[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
+    return target
+
+
+def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
+    """Make sure that the constants a checkpoint stores are the ones this configuration gives."""
+    for constant in derived:
+        if constant.path in source:
+            stored, expected = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
+            if stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2):
+                raise UserError(
+                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
+                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here."
+                )
+
+
+def write(
+    table: NameTable, unread: Iterable[Unread], target: Mapping[str, Tensor], derived: Iterable[Derived] = ()
+) -> dict[str, Tensor]:
+    """Translate our tensors into the foreign names and layouts; what no action reads is written as zeros."""
+    layers: dict[str, dict[int, Tensor]] = defaultdict(dict)
+    released: dict[str, Tensor] = {}
+
+    def put(path: str, layer: int | None, tensor: Tensor) -> None:
+        if layer is None:
+            released[path] = tensor.contiguous()
+        else:
+            layers[path][layer] = tensor
+
+    example = next(iter(target.values()))
+    for name, pieces in table.items():
+        parts = target[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [target[name]]
+        for piece, part in zip(pieces, parts, strict=True):
+            put(piece.path, piece.layer, piece.to_source(part))
+    for gap in unread:
+        put(gap.path, gap.layer, example.new_zeros(gap.shape))
+    for path, by_layer in layers.items():
+        released[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
+    released |= {constant.path: constant.make() for constant in derived}
+    return released
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """How a foreign format names and lays out the tensors of one policy.
+
+    table: our name → the foreign tensors it is made of.
+    unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when written.
+    tied: foreign name → the foreign name it repeats: optional when read, written as a copy.
+    derived: foreign constants that follow from the configuration: dropped when read, recomputed when written.
+    fresh: our names that a checkpoint to start from may lack, beside the memory's: heads that are trained anew.
+    """
+
+    table: NameTable
+    unread: list[Unread] = field(default_factory=list)
+    tied: Mapping[str, str] = field(default_factory=dict)
+    derived: list[Derived] = field(default_factory=list)
+    fresh: frozenset[str] = frozenset()
+
+    def needed(self) -> set[str]:
+        """Foreign names without which the policy cannot be filled."""
+        return {piece.path for pieces in self.table.values() for piece in pieces}
+
+    def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Write our tensors in the foreign names and layouts, the three lists included."""
+        homeless = sorted(set(target) - set(self.table))
+        if homeless:
+            raise UserError(
+                f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
+                "policies without adapters: convert another policy, merge the adapters first, or choose another format."
+            )
+        released = write(self.table, self.unread, target, self.derived)
+        return released | {name: released[original] for name, original in self.tied.items()}
+
+    def shapes(self, target: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+        """Every foreign name but the derived ones, with its shape, where ours have the shapes of `target`."""
+        on_meta = {name: torch.empty_like(target[name], device="meta") for name in self.table}
+        released = write(self.table, self.unread, on_meta)
+        released |= {name: released[original] for name, original in self.tied.items()}
+        return {name: tuple(tensor.shape) for name, tensor in released.items()}
+
+    def translate(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+        """Read foreign tensors into our names; `target` gives the shapes they must have."""
+        self.check_fit(released, target, source)
+        check(self.derived, released)
+        derived = {constant.path for constant in self.derived}
+        return read(self.table, {name: tensor for name, tensor in released.items() if name not in derived})
+
+    def check_fit(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> None:
+        """Compare names and shapes alone, so that foreign tensors may still be on meta: not read yet."""
+        shapes, derived = self.shapes(target), {constant.path for constant in self.derived}
+        tensors = {name: tensor for name, tensor in released.items() if name not in derived}
+        check_fit(tensors, shapes, source, optional=set(shapes) - self.needed())
+
+
+def pi05_of(policy: Policy) -> Pi05Backbone:
+    """The policy's backbone, where it is π0.5: the only one these formats hold."""
+    backbone = getattr(policy, "backbone", None)
+    if not isinstance(backbone, Pi05Backbone):
+        raise UserError(
+            f"Checkpoints of LeRobot's π0.5, openpi and the released trees hold π0.5; this policy's backbone is "
+            f"{type(backbone or policy).__name__}."
+        )
+    return backbone
+
+
+def memory_parameters(policy: Policy) -> set[str]:
+    """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the memory's own expert."""
+    return {name for name in policy.state_dict() if policy.finetune_spec.component_of(name) == "memory"}

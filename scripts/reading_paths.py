@@ -1,0 +1,110 @@
+"""Files and lines that a reader needs for five questions about the library (docs/architecture.md).
+
+(a) and (e) follow imports from a starting point; (b) to (d) list the files on the way. Every file is checked to exist,
+and every call of (d) to be defined where it is listed.
+
+    python scripts/reading_paths.py
+"""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "mme_vla"
+
+MODEL = ["mme_vla.model", "mme_vla.backbone.pi05", "mme_vla.memory.framesamp", "mme_vla.integration.modulator"]
+"""FrameSamp + Modulator, from image to loss."""
+NOT_READ = {"mme_vla", "mme_vla.errors", "mme_vla.registry"}
+"""Of no concern to the mathematics: messages, and the tables of names."""
+SELECTION = ["memory/tokendrop.py", "memory/history.py"]
+HEAD = ["backbone/flow.py"]
+SAMPLING = [
+    ("policy/base.py", "act"), ("policy/mme.py", "sample_actions"), ("model.py", "sample"),
+    ("backbone/pi05.py", "sample"),
+]  # fmt: skip
+ALONE = "README.md"
+
+
+def path_of(module: str) -> Path | None:
+    """The file of a module of the library."""
+    base = ROOT.joinpath(*module.split("."))
+    return next((p for p in (base.with_suffix(".py"), base / "__init__.py") if p.is_file()), None)
+
+
+def imports(file: Path) -> set[str]:
+    """Modules of the library that a file imports when it is imported itself."""
+    names: set[str] = set()
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("mme_vla"):
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                names.add(inner if path_of(inner) else node.module)
+    return names
+
+
+def closure(modules: list[str]) -> list[Path]:
+    """The files that these modules import, themselves included, packages without code aside."""
+    done: set[str] = set()
+    pending = [*modules]
+    while pending:
+        module = pending.pop()
+        if module not in done and (file := path_of(module)) is not None:
+            done.add(module)
+            pending += imports(file)
+    files = {file for module in done - NOT_READ if (file := path_of(module)) is not None}
+    return sorted(file for file in files if len(file.read_text().splitlines()) > 1)
+
+
+def check(files: list[Path]) -> list[Path]:
+    """The files, each of which must exist."""
+    if missing := [str(file) for file in files if not file.is_file()]:
+        sys.exit(f"no such file: {', '.join(missing)}; update the lists in {Path(__file__).name}")
+    return files
+
+
+def sampling() -> list[Path]:
+    """The files of (d), each of which must define its call."""
+    files = check([PACKAGE / name for name, _ in SAMPLING])
+    for file, (_, call) in zip(files, SAMPLING, strict=True):
+        functions = {node.name for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)}
+        if call not in functions:
+            sys.exit(f"{file} defines no {call}(); update the lists in {Path(__file__).name}")
+    return files
+
+
+def block(page: str) -> str:
+    """The example of the model alone on a page."""
+    blocks = (part.split("```")[0] for part in (ROOT / page).read_text().split("```python\n")[1:])
+    (code,) = (code for code in blocks if "MMEModel(" in code)
+    return code
+
+
+def example() -> tuple[int, int]:
+    """Lines of the README's example of the model alone, and the modules of the library that the full one imports."""
+    count = "\nimport sys\nprint(len([name for name in sys.modules if name.split('.')[0] == 'mme_vla']))"
+    command = [sys.executable, "-c", block("docs/python.md") + count]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
+    return len([line for line in block(ALONE).splitlines() if line.strip()]), int(result.stdout.split()[-1])
+
+
+def row(question: str, files: list[Path], note: str = "") -> str:
+    lines = sum(len(file.read_text().splitlines()) for file in files)
+    names = ", ".join(f"`{file.relative_to(PACKAGE)}`" for file in files)
+    return f"| {question} | {note}{len(files)} files, {lines:,} lines | {names} |"
+
+
+def main() -> None:
+    """Print the table."""
+    lines, modules = example()
+    print("| question | to read | files |\n|---|---|---|")
+    print(row("(a) FrameSamp + Modulator, image to loss", closure(MODEL)))
+    print(row("(b) another selection rule of TokenDrop", check([PACKAGE / name for name in SELECTION])))
+    print(row("(c) another flow head", check([PACKAGE / name for name in HEAD])))
+    print(row("(d) where a chunk is sampled", sampling(), f"{len(SAMPLING)} calls, "))
+    print(f"| (e) the model in your own loop | {lines} lines, {modules} modules imported | `{ALONE}` |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,286 @@
+"""Each extra suffices alone: every command runs where the packages of all other extras cannot be imported.
+
+Which packages those are follows from pyproject.toml and from what is installed. A command that needs an extra names it,
+and the words that install it.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from functools import cache
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from helpers.h5_files import write_file
+from mme_vla.cli import COMMANDS
+from mme_vla.errors import UserError
+from mme_vla.evaluation.store import find_records, read_folders
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FOLDER = REPOSITORY / "tests" / "extras"
+NEW = "uv sync --inexact --extra {}"
+
+
+class Case(NamedTuple):
+    """A command, the extras that are there, and how it ends: `says` is a text it prints."""
+
+    extras: tuple[str, ...]
+    words: str
+    says: str
+    code: int = 0
+    wait: str = ""  # stop the command once it has printed this
+    draws: bool = False  # it needs a Vulkan driver
+
+
+TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.patch_size=1"
+TRAIN = f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
+PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
+STEP = "run/checkpoints/step_000001"
+NANO = (
+    "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0 demonstrations.hard=0 "
+    "train.steps=20 train.batch_size=4 train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] drawn_for=[] "
+    "output=nano"
+)
+"""The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes."""
+
+# In this order: some read what an earlier one wrote.
+SUFFICE = [
+    Case((), f"{TRAIN} output=run", "checkpoint"),
+    Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
+    Case((), f"mme_vla cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
+    Case((), "mme_vla convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
+    Case((), "mme_vla exec-starts input=record_dataset_Alpha.h5 output=starts.json", "2 episodes"),
+    Case((), f"mme_vla weights {STEP} lerobot --to lerobot", ""),
+    Case((), "mme_vla subgoal-build input=sample output=rows sets=[simple]", "simple"),
+    Case((), "mme_vla.results --demo --brief", "Made-up records"),
+    Case((), "mme_vla.analyse selection --output kept.mp4 --every 128", "wrote kept.mp4"),
+    Case((), "mme_vla train-tokenizer run", "tokenizer.model"),
+    Case((), "mme_vla sample --help", "full"),
+    Case((), f"mme_vla.probe model=framesamp_modul backbone=tiny {TINY} recordings=sample recorded=1 with=[shuffle] "
+             "draws=2 moments=1 scan=false output=probed", "shuffle"),
+    Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
+    Case(("harness",), "mme_vla harness --help", "flow_steps"),
+    Case(("orbax",), f"mme_vla weights {STEP} jax --to released", ""),
+    Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
+                         "train.open_loop_chunks=0 output=diffused", "checkpoint"),
+    Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
+    Case(("vlm",), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
+                   "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
+    Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
+    Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
+                   "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
+    Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
+    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
+                   "output=tower", "nano_vision.safetensors", draws=True),
+    Case(("sim",), "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
+         "recorded: 1 episodes", draws=True),
+    Case(("sim",), "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
+    Case(("sim",), f"{PLAY} player=random", "records:"),
+    Case(("sim", "play"), f"{PLAY}2 port=0", "open http", wait="ready at http"),
+]  # fmt: skip
+
+NEED = [
+    Case((), "mme_vla.evaluate model=pi05 backbone=tiny", "sim", 2),
+    Case((), "mme_vla record task=PickXtimes episodes=1 output=recorded2", "sim", 2),
+    Case((), "mme_vla gallery task=PickXtimes", "sim", 2),
+    Case((), f"{PLAY} player=random", "sim", 2),
+    Case(("play",), PLAY, "sim", 2),
+    Case(("sim",), PLAY, "play", 2),
+    Case((), f"{PLAY} player=qwenvl", "vlm", 2),
+    Case((), f"{PLAY} player=gemini", "gemini", 2),
+    Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
+    Case((), f"{PLAY} player=openai", "openai", 2),
+    Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
+    Case((), "mme_vla harness --help", "harness", 2),
+    Case((), f"mme_vla weights {STEP} jax2 --to released", "orbax", 2),
+    Case((), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
+    Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
+    Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
+    Case((), "mme_vla.train model=diffusion_policy output=run4", "baselines", 2),
+    Case((), "mme_vla.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
+    Case((), "mme_vla.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the commands are run."""
+    folder = tmp_path_factory.mktemp("extras")
+    write_file(folder / "record_dataset_Alpha.h5", [9, 7])
+    return folder
+
+
+def run(case: Case, folder: Path) -> tuple[int, str]:
+    """Exit code and output of a command, run where only its own extras are installed."""
+    if not all(is_installed(extra) for extra in case.extras):
+        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
+    if case.draws and not can_draw():
+        pytest.skip("no Vulkan driver: scripts/install_vulkan.sh installs one")
+    path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
+    variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(case.extras)),
+                 "HF_HUB_OFFLINE": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
+                 "OPENAI_API_KEY": "none"}  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-m", *case.words.split()], env=variables, cwd=folder,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    with process:
+        assert process.stdout is not None
+        printed = ""
+        for line in process.stdout:
+            printed += line
+            if case.wait and case.wait in line:
+                process.terminate()
+    return process.returncode, printed
+
+
+@cache
+def can_draw() -> bool:
+    from mme_vla.envs.rendering import render_backend
+
+    try:
+        render_backend()
+    except (UserError, ImportError):
+        return False
+    return True
+
+
+def name_of(case: Case) -> str:
+    return f"{'+'.join(case.extras) or 'none'}:{case.words.split()[0].removeprefix('mme_vla.')}:{case.says}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SUFFICE, ids=name_of)
+def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> None:
+    code, output = run(case, folder)
+    assert code == case.code and case.says in output, output[-3000:]
+    if case.words.endswith(NANO):  # run again, it computes nothing twice
+        nano = folder / "nano"
+        records = read_folders(find_records([nano / "framesamp_modul"]))
+        assert sorted(record.episode for record in records) == [0, 1]
+        assert {record.action_space for record in records} == {"waypoint"}
+        page = (nano / "page.md").read_text()
+        assert "| framesamp_modul" in page and "| planner" in page and (nano / "learning.png").is_file()
+        videos = list(nano.glob("films/failure/**/*.mp4"))
+        assert len(videos) == 1 and videos[0].name in page
+        saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
+        assert run(case, folder)[0] == 0
+        assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == saved
+        assert len(read_folders(find_records([nano / "framesamp_modul"]))) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", NEED, ids=name_of)
+def test_a_command_names_the_extra_that_it_needs(folder: Path, case: Case) -> None:
+    code, output = run(case, folder)
+    assert code == case.code and "Traceback" not in output, output[-3000:]
+    assert f"extra `{case.says}`" in output and NEW.format(case.says) in output
+
+
+def test_every_command_is_among_the_cases() -> None:
+    words = [case.words.split() for case in SUFFICE]
+    assert {w[1] if w[0] == "mme_vla" else w[0].removeprefix("mme_vla.") for w in words} == set(COMMANDS)
+
+
+def test_each_extra_is_among_the_cases() -> None:
+    # What is behind an address answers only to who has a key.
+    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"dev", "gemini", "openai", "wandb"}
+
+
+def test_what_is_hidden_is_what_only_other_extras_bring() -> None:
+    assert {"websockets", "msgpack"} <= set(hidden(("sim",))) or not is_installed("serve")
+    for extra in filter(is_installed, needs()):
+        assert {module_of(name) for name in needs()[extra]} & set(hidden((extra,))) == set()
+    assert {"torch", "lerobot", "hydra", "google.protobuf"} & set(hidden(())) == set()
+
+
+@cache
+def installed() -> dict[str, Distribution]:
+    return {canonicalize_name(distribution.metadata["Name"]): distribution for distribution in distributions()}
+
+
+@cache
+def needs() -> dict[str, list[str]]:
+    """The packages that each extra names."""
+    requirements: dict[str, list[str]] = {}
+    for requirement in required("mme-vla"):
+        named = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
+        if named:
+            requirements.setdefault(named[1], []).append(canonicalize_name(requirement.name))
+    return requirements
+
+
+@cache
+def required(name: str) -> list[Requirement]:
+    return [Requirement(line) for line in installed()[name].requires or []]
+
+
+def is_installed(extra: str) -> bool:
+    return all(name in installed() for name in needs()[extra])
+
+
+def closure(names: Iterable[tuple[str, str]]) -> set[str]:
+    """Distributions, and all that they need; each with the extra that is asked of it."""
+    visited: set[tuple[str, str]] = set()
+    pending = list(names)
+    while pending:
+        name, extra = pending.pop()
+        if (name, extra) in visited or name not in installed():
+            continue
+        visited.add((name, extra))
+        for requirement in required(name):
+            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
+                pending += [(canonicalize_name(requirement.name), each) for each in ("", *requirement.extras)]
+    return {name for name, _ in visited}
+
+
+@cache
+def modules() -> dict[str, set[str]]:
+    """Each module and package, down to the first folder with an `__init__`, and the distributions that bring it."""
+    owners: dict[str, set[str]] = {}
+    listed = {name: (paths.read_text("RECORD") or "").splitlines() for name, paths in installed().items()}
+    files = {name: {line.partition(",")[0] for line in lines} for name, lines in listed.items()}
+    packages = {file.removesuffix("/__init__.py") for each in files.values() for file in each}
+    for name, each in files.items():
+        for file in each:
+            if not file.endswith((".py", ".so")) or file.startswith("..") or ".dist-info/" in file:
+                continue
+            inside = ""
+            for part in file.split("/"):
+                inside = f"{inside}/{part}".lstrip("/")
+                owners.setdefault(dotted(inside), set()).add(name)
+                if inside in packages:
+                    break
+    return owners
+
+
+def dotted(file: str) -> str:
+    """The module that a file is: `a/b.cpython-312.so` is `a.b`."""
+    folder, _, name = file.rpartition("/")
+    return f"{folder.replace('/', '.')}.{name.partition('.')[0]}".lstrip(".")
+
+
+@cache
+def hidden(extras: Sequence[str]) -> list[str]:
+    """Modules that would not be there if only these extras were installed."""
+    there = closure([("mme-vla", ""), *(("mme-vla", extra) for extra in extras)])
+    return sorted(module for module, owners in modules().items() if not owners & there)
+
+
+def module_of(distribution: str) -> str:
+    return next((m for m, owners in modules().items() if distribution in owners and "." not in m), distribution)
+
+
+def test_install_lines_name_what_a_clone_has_and_no_index() -> None:
+    pages = [REPOSITORY / "README.md", *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("mme_vla/**/*.py")]
+    text = {page.name: page.read_text() for page in pages}
+    assert [name for name, content in text.items() if re.search(r"pip install \S*mme-vla", content)] == []
+    named = {extra for content in text.values() for extra in re.findall(r"--extra ([a-z]\w*)", content)}
+    assert {"sim", "serve"} <= named <= set(needs())

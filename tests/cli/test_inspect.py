@@ -1,0 +1,107 @@
+"""`python -m mme_vla.inspect` shows what is there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from mme_vla import UserError, build_policy
+from mme_vla.cli.inspect import (
+    build_memory,
+    check_place,
+    draw_memory,
+    main,
+    show_checkpoint,
+    show_dataset,
+    show_episode,
+)
+from mme_vla.config.composition import compose
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.memory_image import memory_sheet
+from mme_vla.utils.media import MARGIN, TILE
+
+
+@pytest.fixture
+def console() -> Console:
+    return Console(record=True, width=160, quiet=False, file=open("/dev/null", "w"))  # noqa: PTH123
+
+
+@pytest.fixture(scope="module")
+def sample() -> EpisodeSource:
+    return EpisodeSource("sample")
+
+
+def test_a_dataset_shows_its_episodes(sample: EpisodeSource, console: Console) -> None:
+    show_dataset(sample, console)
+    text = console.export_text()
+    assert all(sample.goal(episode)[:30] in text for episode in range(len(sample)))
+    assert str(int(sample.lengths.sum())) in text
+
+
+def test_an_episode_shows_its_phases_and_subgoals(sample: EpisodeSource, console: Console) -> None:
+    show_episode(sample, 0, 100, console)
+    text = console.export_text()
+    assert f"frames 0 … {sample.exec_starts[0] - 1}" in text
+    assert sample.subgoals(0, 100)["simple_subgoal"] in text
+
+
+@pytest.mark.parametrize("name", ["tokendrop", "framesamp"])
+def test_a_memory_is_rendered_as_it_selects(sample: EpisodeSource, console: Console, tmp_path: Path, name: str) -> None:
+    memory = build_memory(compose("inspect", [f"memory={name}"]))
+    path = draw_memory(sample, 3, 120, memory, name, tmp_path, console)
+    with Image.open(path) as image:
+        assert image.width > 800
+    assert f"of {memory.budget} tokens" in console.export_text()
+
+
+def test_remembered_patches_keep_their_colour_and_others_are_dimmed() -> None:
+    frames = np.zeros((3, 64, 64, 3), np.uint8)
+    frames[..., 0] = 200
+    sheet = memory_sheet(frames, np.array([[0, 0]]), grid=4, exec_start=1, step=2, title="x")
+    top = sheet.height - MARGIN - TILE - 32
+    inside = sheet.getpixel((MARGIN + TILE // 8, top + TILE // 8))
+    outside = sheet.getpixel((MARGIN + TILE * 7 // 8, top + TILE * 7 // 8))
+    assert inside == (200, 0, 0)
+    assert isinstance(outside, tuple)
+    assert len(set(outside)) == 1
+    assert outside[0] > 150
+
+
+def test_more_frames_than_fit_are_counted() -> None:
+    frames = np.zeros((80, 16, 16, 3), np.uint8)
+    selected = np.array([[frame, 0] for frame in range(80)])
+    assert memory_sheet(frames, selected, 2, 0, 79, "t" * 500).height < 2000
+
+
+def test_a_checkpoint_shows_its_parts(tmp_path: Path, console: Console) -> None:
+    policy = build_policy("framesamp_modul", memory={"budget": 64})
+    policy.save_pretrained(tmp_path)
+    show_checkpoint(tmp_path, console)
+    text = console.export_text()
+    assert f"{sum(p.numel() for p in policy.parameters()):,}" in text
+    assert all(part in text for part in ("vision", "vlm", "memory", "action"))
+    assert "budget=64" in text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([], "Name one thing"),
+        (["dataset=sample", "checkpoint=x"], "Name one thing"),
+        (["checkpoint=/nowhere"], "No checkpoint at /nowhere"),
+        (["dataset=/nowhere"], "No LeRobot dataset"),
+    ],
+)
+def test_nothing_to_inspect_is_explained(overrides: list[str], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        main(compose("inspect", overrides))
+
+
+def test_a_place_outside_the_data_is_refused(sample: EpisodeSource) -> None:
+    assert check_place(sample, 0, None) == (0, int(sample.lengths[0]) - 1)
+    with pytest.raises(UserError, match="episodes 0 … 3"):
+        check_place(sample, 4, 0)
+    with pytest.raises(UserError, match="frames 0 … 172"):
+        check_place(sample, 0, 173)

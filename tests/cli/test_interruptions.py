@@ -1,0 +1,210 @@
+"""Commands that are interrupted, refused by the disk, or met by a second process in their folder."""
+
+import errno
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from helpers.h5_files import write_file
+from mme_vla import cli
+from mme_vla.cli.errors import Terminated, print_user_errors
+from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.hdf5 import find_files, list_episodes
+from mme_vla.envs.recording.outputs import Job, RecordingPlan
+from mme_vla.errors import UserError
+from mme_vla.training.runs import MAY_DIFFER, SUMMARY, check_content, claim_run
+from mme_vla.utils import PLAN, FolderLock, claim_plan, draft_of, drop_plan, remove_drafts, write_json
+
+PNG = ConvertOptions(images="png")
+CONFIG = {"train": {"steps": 3}, "seed": 1}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code", "words"), [("SIGINT", 130, "Ctrl-C"), ("SIGTERM", 143, "SIGTERM")])
+def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str, code: int, words: str) -> None:
+    script = f"""
+        import signal
+        from mme_vla.cli.errors import print_user_errors
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the parent did with it
+        with print_user_errors(), print_user_errors():
+            signal.raise_signal(signal.{number})
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True)
+    assert (done.returncode, "Traceback" in done.stderr) == (code, False)
+    assert done.stderr.count("\n") == 1
+    assert f"Stopped by {words}" in done.stderr
+
+
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt(), 130), (Terminated(), 143)], ids=["Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("hidden", [AttributeError("half-made"), UserError("cannot be composed")], ids=["bug", "user"])
+def test_a_signal_is_reported_though_a_finally_fails(
+    stop: BaseException, code: int, hidden: Exception, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended, print_user_errors():
+        try:
+            raise stop
+        finally:
+            raise hidden
+    assert ended.value.code == code
+    assert "Stopped by" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sentence(monkeypatch, capsys) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "import_module", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        cli.run("train")
+    assert ended.value.code == 130
+    assert "Stopped by Ctrl-C" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", ["cli", "play", "nano", "envs", "serving", "subgoal"])
+def test_nothing_slow_is_imported_before_a_command_can_be_stopped(room: str) -> None:
+    """`python -m mme_vla.<room>…` imports the package first, and only then what turns signals into a sentence."""
+    script = f"import sys, mme_vla.{room}; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "a/metrics.jsonl"), "a/metrics.jsonl cannot be written"),
+        (OSError(errno.EROFS, "Read-only file system", "b"), "can only be read"),
+        (OSError(errno.EFBIG, "File too large", "b"), "ulimit -f"),
+        (OSError(errno.EMFILE, "Too many open files", "b"), "ulimit -n"),
+        (PermissionError(errno.EACCES, "Permission denied", "b"), "permission is denied"),
+        (OSError("Unable to create file (name = 'c.h5', errno = 28, error message = '…')"), "c.h5 cannot be written"),
+        (RuntimeError("I/O error: No space left on device (os error 28)"), "no room left"),
+        (OSError("4000 requested and 96 written"), "no room left"),
+    ],
+)
+def test_what_the_disk_refuses_is_reported_in_one_sentence(
+    capsys: pytest.CaptureFixture[str], error: Exception, words: str
+) -> None:
+    with pytest.raises(SystemExit) as ended, print_user_errors():
+        raise error
+    stderr = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert words in stderr
+    assert "epeat" in stderr
+
+
+def test_other_errors_keep_their_traceback() -> None:
+    for error in (ValueError("errno = 28"), PermissionError(errno.EACCES, "a port"), OSError("strange")):
+        with pytest.raises(type(error)), print_user_errors():
+            raise error
+
+
+def test_an_error_of_writing_learns_its_place_from_the_lock(tmp_path: Path) -> None:
+    with pytest.raises(OSError) as caught, FolderLock(tmp_path / "run"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.filename == str(tmp_path / "run")
+
+
+def test_a_released_lock_leaves_nothing_and_work_stays(tmp_path: Path) -> None:
+    FolderLock(tmp_path / "empty").acquire().release()
+    assert not (tmp_path / "empty").exists()
+    with FolderLock(tmp_path / "full"):
+        (tmp_path / "full" / "work").touch()
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["work"]
+
+
+@pytest.mark.slow
+def test_drafts_of_killed_processes_are_removed_and_those_of_others_are_not(tmp_path: Path) -> None:
+    mine, other_draft = draft_of(tmp_path / "a"), tmp_path / ".a.elsewhere-1-00000000.partial"
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    dead = tmp_path / mine.name.replace(f"-{os.getpid()}-", f"-{ended.pid}-")
+    for path in (mine, other_draft, dead):
+        path.touch()
+    remove_drafts(tmp_path)
+    assert set(tmp_path.iterdir()) == {mine, other_draft}
+
+
+def test_an_incomplete_plan_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / PLAN).write_text('{"epis')
+    (tmp_path / "episodes").mkdir()
+    assert claim_plan(tmp_path, {"a": 1})
+    assert claim_plan(tmp_path, {"a": 1})
+    assert not claim_plan(tmp_path, {"a": 2})
+    (tmp_path / PLAN).write_text('{"epis')
+    (tmp_path / "episodes" / "finished").touch()
+    assert not claim_plan(tmp_path, {"a": 1}), "somebody's work lies there"
+    drop_plan(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_conversion_notices_that_an_input_changed_at_the_same_size(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Alpha.h5", [4])
+    convert(list_episodes(find_files([tmp_path])), tmp_path / "out", PNG)
+    import h5py
+
+    with h5py.File(tmp_path / "record_dataset_Alpha.h5", "r+") as file:
+        file["episode_0/timestep_1/action/joint_action"][0] += 1
+    refs = list_episodes(find_files([tmp_path]))
+    with pytest.raises(UserError, match="other content of a file"):
+        convert(refs, tmp_path / "out", PNG)
+
+
+def test_a_second_conversion_into_one_folder_is_refused(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Alpha.h5", [4])
+    refs = list_episodes(find_files([tmp_path]))
+    with FolderLock(tmp_path / "out.partial"), pytest.raises(UserError, match="in use by another conversion"):
+        convert(refs, tmp_path / "out", PNG)
+
+
+def test_runs_that_begin_in_one_second_take_separate_folders(tmp_path: Path) -> None:
+    place = tmp_path / "2026-01-01_00-00-00"
+    first, first_lock = claim_run(place, False, None, CONFIG)
+    second, too = claim_run(place, False, None, CONFIG)
+    assert (first.folder, second.folder) == (place, place.with_name(f"{place.name}-2"))
+    with pytest.raises(UserError, match="in use by another training run"):
+        claim_run(place, True, None, CONFIG)
+    first_lock.release()
+    too.release()
+    write_json(place / SUMMARY, {})
+    third, lock = claim_run(place, False, None, CONFIG)
+    lock.release()
+    assert third.folder == second.folder, "the first folder holds a run by now"
+
+
+def test_training_data_that_changed_are_noticed(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "step_000001"
+    checkpoint.mkdir()
+    for name in ("raw.safetensors", "optimizer.safetensors"):
+        (checkpoint / name).touch()
+    state = {"format": "mme_vla training checkpoint 1", "step": 1, "versions": {}}
+    state["config"] = {"data": {"content": ["a", "b"]}}
+    write_json(checkpoint / "training_state.json", state)
+    check_content(checkpoint, ["a", "b"])
+    with pytest.raises(UserError, match=r"number 1 of data\.sources"):
+        check_content(checkpoint, ["a", "c"])
+    assert "data.content" in MAY_DIFFER, "it is compared when the data are open, not before"
+
+
+def test_a_finished_recording_is_recognised_and_others_are_not(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Alpha.h5", [4], numbers=[1])
+    job = Job("Alpha", 1, seed=98, difficulty="easy", recovery=None, retries=3)
+    assert RecordingPlan([job], None, tmp_path).missing(PNG) == []
+    other = Job("Alpha", 1, seed=101, difficulty="easy", recovery=None, retries=3)
+    with pytest.raises(UserError, match="not what this command records"):
+        RecordingPlan([other], None, tmp_path).missing(PNG)
+    assert RecordingPlan([job], tmp_path / "dataset", None).missing(PNG) == [tmp_path / "dataset"]
+
+
+def test_what_a_recording_left_that_was_killed_after_its_last_move_is_removed(tmp_path: Path) -> None:
+    dataset, work = tmp_path / "dataset", tmp_path / "dataset.partial"
+    dataset.mkdir()
+    assert claim_plan(work, {"a": 1})
+    (work / "episodes" / "one").mkdir(parents=True)
+    RecordingPlan([], dataset, None).tidy()
+    assert list(tmp_path.iterdir()) == [dataset]
+    with FolderLock(work), pytest.raises(UserError, match="in use by another conversion"):
+        RecordingPlan([], dataset, None).tidy()

@@ -1,0 +1,25 @@
+"""The launchers of the extra `sweep` run the jobs of a sweep as processes of this machine."""
+
+from pathlib import Path
+
+import pytest
+
+from helpers import commands
+
+pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="launchers: uv sync --inexact --extra sweep")
+pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="launchers: uv sync --inexact --extra sweep")
+
+TINY = ("backbone=tiny", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_a_launcher_runs_every_job_of_a_sweep(launcher: str, tmp_path: Path) -> None:
+    done = commands.run(
+        "mme_vla.probe", "--multirun", f"launcher={launcher}", "seed=7,42", "model=framesamp_modul", *TINY,
+        "recordings=sample", "recorded=1", "with=[shuffle]", "draws=2", "moments=1", "scan=false",
+        f"output={tmp_path}/${{seed}}", f"hydra.sweep.dir={tmp_path}/sweep",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    probed = {seed: sorted(file.name for file in (tmp_path / seed).iterdir()) for seed in ("7", "42")}
+    assert "table.md" in probed["7"] and probed["7"] == probed["42"]

@@ -1,0 +1,300 @@
+"""Composition of the YAML tree, and how a command answers what was mistyped."""
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from hydra import initialize_config_dir
+from hydra._internal.utils import get_args_parser
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from helpers import commands
+from mme_vla.cli.command import check_overrides, cli, options_first
+from mme_vla.config.composition import compose, config_dir, import_plugins, true_name
+from mme_vla.config.naming import join_memories
+from mme_vla.errors import UserError
+
+MODELS = ["pi05"] + [
+    f"{memory}_{how}" for memory in ("framesamp", "tokendrop", "ttt", "rmt") for how in ("context", "modul", "expert")
+]
+
+TREE = {
+    "demo.yaml": """
+        defaults: [{train: default}, {memory: none}, {model: small}, _self_]
+        plugins: []
+        seed: 1
+        fast: false
+        """,
+    "train/default.yaml": "{lr: 1e-3, steps: 10, clip: {norm: 1.0}, note: null}",
+    "memory/none.yaml": "{}",
+    "memory/tokendrop.yaml": "{name: tokendrop, budget: 512}",
+    "model/small.yaml": """
+        # @package _global_
+        defaults: [{override /memory: none}]
+        name: small
+        """,
+    "model/tokendrop_expert.yaml": """
+        # @package _global_
+        defaults: [{override /memory: tokendrop}]
+        name: tokendrop_expert
+        """,
+}
+
+
+def write_tree(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(textwrap.dedent(text))
+    return folder
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    return write_tree(tmp_path / "tree", TREE)
+
+
+def test_a_model_defines_its_memory(tree: Path) -> None:
+    cfg = compose("demo", ["model=tokendrop_expert", "train.lr=1e-4"], directory=tree)
+    assert (cfg.name, cfg.memory.budget, cfg.train.lr) == ("tokendrop_expert", 512, 1e-4)
+    assert "hydra" not in cfg
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        (
+            "model=tokendrp_expert",
+            "Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'? Known: small,",
+        ),
+        ("train.lrr=1", "Unknown config key 'train.lrr'. In 'train': Did you mean 'lr'? Known: clip, lr, note, steps."),
+        ("~train.lrr", "Did you mean 'lr'?"),
+        ("lr=1", "Unknown config key 'lr'. Did you mean 'train.lr'?"),
+        ("modle=small", "Unknown config key 'modle'. Did you mean 'model'?"),
+        ("memory.budget=64", "'memory' has no keys under these choices"),
+        ("train.clip.norm.x=1", "'train.clip.norm' is a value"),
+        ("train.steps=many", "'train.steps' is a number (default 10)"),
+        ("train.clip=1", "'train.clip' is a section with the keys norm"),
+        ("train.clip={nrm: 1}", "Unknown config key 'train.clip.nrm'. In 'train.clip': Did you mean 'norm'?"),
+        ("train.clip={of: 1}", "Known: norm. To add it: +train.clip.of=…"),
+        ("fast=1", "'fast' is true or false"),
+        ("train=3", "names no config of the group. Known: default."),
+        ("=3", "the key is missing"),
+        ("train.steps=[1", "Cannot read the override 'train.steps=[1'"),
+    ],
+)
+def test_a_mistake_is_answered_with_the_near_names(tree: Path, override: str, message: str) -> None:
+    with pytest.raises(UserError) as caught:
+        compose("demo", [override], directory=tree)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "words", [["model=framesamp_modul", "~memory.name"], ["model=pi05", "integration=modulator", "+memory.budget=64"]]
+)
+def test_a_memory_without_a_name_is_reported(words: list[str]) -> None:
+    with pytest.raises(UserError, match="`memory` has no name, only budget"):
+        compose("train", words)
+
+
+@pytest.mark.parametrize("override", ["train.note=text", "train.lr=2", "train.clip=null", "+train.x=1", "seed=${fast}"])
+def test_a_fitting_value_passes(tree: Path, override: str) -> None:
+    compose("demo", [override], directory=tree)
+
+
+def test_a_broken_file_and_a_missing_folder_are_named(tree: Path) -> None:
+    (tree / "model" / "broken.yaml").write_text("key: [1\nother: 2")
+    with pytest.raises(UserError, match=r"Cannot read a config file.*\n?.*broken\.yaml"):
+        compose("demo", ["model=broken"], directory=tree)
+    with pytest.raises(UserError, match=r"'demoo'\. Did you mean 'demo'"):
+        compose("demoo", directory=tree)
+    with pytest.raises(UserError, match="nowhere' does not exist"):
+        compose("demo", directory=tree / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["a=1", "--config-dir", "b", "c=2", "-m", "d=3"],
+        ["--config-dir=b", "a=1", "c=2", "--multirun", "d=3"],
+        ["-m", "--config-dir", "b", "a=1", "c=2", "d=3"],
+    ],
+)
+def test_options_may_stand_anywhere(words: list[str]) -> None:
+    ordered = options_first(words)
+    assert ordered[-3:] == ["a=1", "c=2", "d=3"]
+    assert sorted(ordered) == sorted(words)
+    args = get_args_parser().parse_args(ordered)
+    assert (args.config_dir, args.multirun, args.overrides) == ("b", True, ["a=1", "c=2", "d=3"])
+
+
+def test_an_options_value_may_equal_a_word() -> None:
+    words = ["--config-dir", "memory", "--help", "memory"]
+    assert options_first(words) == words
+
+
+def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
+    check_overrides(
+        "demo",
+        ["model=small,tokendrop_expert", "train.steps=range(1,4)", "seed=choice(1,2)", "train.lr=interval(0,1)"],
+        directory=tree,
+    )
+    with pytest.raises(UserError, match="Unknown model 'third'"):
+        check_overrides("demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree)
+
+
+def test_the_same_words_give_equal_but_separate_configurations() -> None:
+    words = ["model=framesamp_modul", "train.steps=3", "output=runs/one"]  # the default folder's name holds the time
+    one, other = (compose("train", words) for _ in range(2))
+    assert one == other
+    one.train.steps = 7
+    one.memory.budget = 64
+    again = compose("train", words)
+    assert again == other and again.train.steps == 3
+
+
+def test_files_of_the_user_are_read_again_each_time(tree: Path) -> None:
+    before = compose("demo", directory=tree).seed
+    file = tree / "demo.yaml"
+    file.write_text(file.read_text().replace(f"seed: {before}", f"seed: {before + 1}"))
+    assert compose("demo", directory=tree).seed == before + 1
+
+
+def test_further_folders_add_choices(tree: Path, tmp_path: Path) -> None:
+    mine = write_tree(tmp_path / "mine", {"memory/mine.yaml": "{name: mine, budget: 7}"})
+    assert compose("demo", ["memory=mine"], directory=tree, extra_dirs=[mine]).memory.budget == 7
+    with pytest.raises(UserError, match="Unknown memory 'mine'"):
+        compose("demo", ["memory=mine"], directory=tree)
+
+
+def test_composing_leaves_a_running_hydra_as_it_was(tree: Path) -> None:
+    with initialize_config_dir(str(tree), version_base="1.3", job_name="outer"):
+        outer = GlobalHydra.instance().hydra
+        compose("demo", directory=tree)
+        with pytest.raises(UserError):
+            compose("demo", ["model=no"], directory=tree)
+        assert GlobalHydra.instance().hydra is outer
+
+
+def test_plugins_are_imported_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_plugin_module.py").write_text("import sys\nloaded = True\n")
+    (tmp_path / "my_broken_plugin.py").write_text("import no_such_module_here\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    import_plugins(OmegaConf.create({"plugins": ["my_plugin_module"]}))
+    assert sys.modules["my_plugin_module"].loaded
+    with pytest.raises(UserError, match="No module named 'my_plugin'"):
+        import_plugins(OmegaConf.create({"plugins": ["my_plugin"]}))
+    with pytest.raises(ModuleNotFoundError, match="no_such_module_here"):
+        import_plugins(OmegaConf.create({"plugins": ["my_broken_plugin"]}))
+    import_plugins(OmegaConf.create({}))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_every_model_of_the_library_composes(model: str) -> None:
+    assert compose("policy", [f"model={model}"]).name == model
+
+
+@pytest.mark.parametrize("model", MODELS[::6])
+def test_a_models_name_is_the_one_that_comparing_all_models_would_find(model: str) -> None:
+    cfg = compose("train", [f"model={model}", "train.steps=2"])
+    assert true_name(join_memories(cfg.copy()), "train", (config_dir().resolve(),)) == model
+
+
+def test_a_misspelt_model_of_the_library_is_answered() -> None:
+    with pytest.raises(UserError, match="Did you mean 'tokendrop_expert'"):
+        compose("policy", ["model=tokendrp_expert"])
+    assert (config_dir() / "model").is_dir()
+
+
+APP = """
+    from pathlib import Path
+    from mme_vla.cli.command import cli
+    from mme_vla.errors import UserError
+
+    @cli("demo", Path({tree!r}))
+    def main(cfg):
+        if cfg.seed == 13:
+            raise UserError("Seed 13 brings [bad] luck.")
+        if cfg.seed == 14:
+            raise RuntimeError("a bug")
+        from hydra.core.hydra_config import HydraConfig
+        print("ran", cfg.name, cfg.memory.get("budget"), cfg.train.lr, HydraConfig.get().job.name)
+
+    if __name__ == "__main__":
+        main()
+"""
+
+
+@pytest.fixture
+def app(tree: Path, tmp_path: Path) -> Path:
+    file = tmp_path / "app.py"
+    file.write_text(textwrap.dedent(APP).format(tree=str(tree)))
+    return file
+
+
+def run(app: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return commands.run(str(app), *arguments, cwd=app.parent)
+
+
+@pytest.mark.slow
+def test_a_command_runs_with_hydras_run_folder(app: Path) -> None:
+    done = run(app, "model=tokendrop_expert", "hydra.run.dir=here")
+    assert done.stdout == "ran tokendrop_expert 512 0.001 app\n", done.stderr
+    assert (app.parent / "here" / ".hydra" / "config.yaml").is_file()
+
+
+@pytest.mark.slow
+def test_a_mistyped_command_ends_before_it_starts(app: Path) -> None:
+    done = run(app, "model=tokendrp_expert")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("Error: Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'?")
+    assert "Traceback" not in done.stderr
+    assert not (app.parent / "outputs").exists()
+
+
+@pytest.mark.slow
+def test_a_user_error_is_printed_completely_and_a_bug_keeps_its_traceback(app: Path) -> None:
+    done = run(app, "seed=13")
+    assert done.returncode == 2
+    assert "Error: Seed 13 brings [bad] luck." in done.stderr
+    assert "Traceback" not in done.stderr
+    bug = run(app, "seed=14")
+    assert bug.returncode == 1
+    assert "Traceback" in bug.stderr
+    assert "app.py" in bug.stderr
+
+
+@pytest.mark.slow
+def test_a_value_still_needed_is_requested(app: Path, tree: Path) -> None:
+    (tree / "train" / "default.yaml").write_text("lr: 1\ndata: ???")
+    done = run(app)
+    assert done.returncode == 2
+    assert "A value is needed for train.data: add train.data=…" in done.stderr
+    assert run(app, "--cfg", "job").returncode == 0
+
+
+@pytest.mark.slow
+def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
+    mine = write_tree(tmp_path / "mine", {"memory/mine.yaml": "{name: mine, budget: 7}"})
+    swept = run(app, "--multirun", "--config-dir", str(mine), "train.lr=1,2", "memory=mine")
+    assert [line for line in swept.stdout.splitlines() if line.startswith("ran")] == [
+        "ran mine 7 1 app",
+        "ran mine 7 2 app",
+    ], swept.stderr
+    output = run(app, "--cfg", "job", "seed=5")
+    assert "seed: 5" in output.stdout
+    assert run(app, "--help").returncode == 0
+    wrong = run(app, "--config-dir", "nowhere")
+    assert wrong.returncode == 2
+    assert "nowhere' does not exist" in wrong.stderr
+
+
+def test_a_command_can_be_called_with_a_config() -> None:
+    @cli("demo")
+    def double(cfg: dict) -> int:
+        return 2 * cfg["x"]
+
+    assert double({"x": 4}) == 8

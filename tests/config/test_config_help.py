@@ -1,0 +1,107 @@
+"""What commands answer to `--help`, to options that do not exist, and to keys that are called otherwise here."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from helpers import REPOSITORY, commands
+from mme_vla.cli.command import help_text
+from mme_vla.cli.help import COMMANDS, choices, defaults, keys, near_keys
+from mme_vla.config.composition import compose, config_dir
+from mme_vla.errors import UserError
+
+MODULES = {name: words.removeprefix("python -m ") for name, words in COMMANDS.items() if "python" in words}
+
+
+def ask(module: str, *words: str, code: int = 0) -> str:
+    """What a command says; it must end with `code` and never with a traceback."""
+    environment = {"COLUMNS": "100", "PATH": "", "HOME": str(REPOSITORY)}
+    done = commands.run(module, *words, env=environment)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_help_tells_what_a_command_does_with_examples_and_every_key(name: str) -> None:
+    text = help_text(name, [], [config_dir()])
+    file = config_dir() / f"{name}.yaml"
+    assert text.startswith(f"Usage: {COMMANDS[name]} ")
+    assert f"Examples\n  {COMMANDS[name]}" in text
+    flat = re.sub(r"\s+", " ", text)
+    for key in keys(file):
+        assert not key.default or f"{key.name}={key.default}" in flat
+        assert re.sub(r"\s+", " ", key.comment) in flat, key
+    for group, option in defaults(file).groups.items():
+        if not group.startswith("override"):
+            assert f"{group}={option}" in flat
+            assert all(choice in flat for choice in choices([config_dir()], group))
+
+
+def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> None:
+    (tmp_path / "memory").mkdir()
+    (tmp_path / "memory" / "mine.yaml").write_text("# Remembers what I like.\nname: mine\nspacing: 4 # steps apart\n")
+    text = help_text("train", ["memory"], [config_dir(), tmp_path])
+    assert "memory=mine\n  Remembers what I like.\n" in text
+    assert re.search(r"memory.spacing=4 +steps apart", text)
+    assert re.search(r"memory.budget=512 +memory tokens; a multiple of grid²", text)
+    with pytest.raises(UserError, match=r"'memori' is no group of this command\. Did you mean 'memory'\?"):
+        help_text("train", ["memori"], [config_dir()])
+
+
+@pytest.mark.slow
+def test_help_under_a_choice_shows_its_keys() -> None:
+    text = ask("mme_vla.train", "--help", "model=framesamp_modul")
+    assert text.startswith("Usage: python -m mme_vla.train ")
+    assert "memory=framesamp\n" in text
+    assert re.search(r"integration.num_heads=4 +query heads", text)
+    assert "Did you mean 'framesamp_modul'" in ask("mme_vla.train", "--help", "model=framesamp_modl", code=2)
+
+
+@pytest.mark.slow
+def test_help_needs_no_torch() -> None:
+    watch = "import sys, runpy; sys.argv = ['x', '--help']\n" \
+            "try: runpy.run_module('mme_vla.train', run_name='__main__')\n" \
+            "except SystemExit: pass\nprint('torch' in sys.modules, file=sys.stderr)"  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", watch], capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.stderr.split()[-1] == "False", done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("module", "words", "message"),
+    [
+        ("mme_vla.train", ["--steps", "10"], "There is no option '--steps'.*write train.steps=10"),
+        ("mme_vla.train", ["--learning-rate=1"], "There is no option '--learning-rate=1'"),
+        ("mme_vla.evaluate", ["--max-steps=9", "tasks=all"], "write max_steps=9"),
+    ],
+)
+def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(
+    module: str, words: list[str], message: str
+) -> None:
+    assert re.search(message, ask(module, *words, code=2).replace("\n", " "))
+
+
+@pytest.mark.parametrize(
+    ("command", "word", "message"),
+    [
+        ("evaluate", "mode=background", "Did you mean 'subgoal_mode'"),
+        ("evaluate", "train.device=cuda", "Did you mean 'device'?"),
+        ("train", "device=cuda", "Did you mean 'train.device'?"),
+        ("serve", "batch=3", "Did you mean 'max_batch'"),
+    ],
+)
+def test_a_key_with_another_name_here_is_suggested(command: str, word: str, message: str) -> None:
+    with pytest.raises(UserError, match=re.escape(message)):
+        compose(command, [word])
+
+
+def test_near_keys_are_the_equal_ones_then_parts_then_like_ones() -> None:
+    paths = ["train", "train.steps", "max_steps", "seed"]
+    assert near_keys("steps", paths) == ["train.steps"]
+    assert near_keys("max", paths) == ["max_steps"]
+    assert near_keys("sed", paths) == ["seed"]
+    assert near_keys("zzz", paths) == []

@@ -1,0 +1,114 @@
+"""Logs, answers, prompts and states that cannot be: one sentence each, never a traceback."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers import artefacts
+from mme_vla.envs import metadata
+from mme_vla.errors import UserError
+from mme_vla.evaluation.store import RECORDS, read_records, read_run
+from mme_vla.processing.normalise import QuantileStats, check_reach
+from mme_vla.processing.prompt import checked_text
+from mme_vla.utils import verified, with_checksum
+
+
+def test_a_digit_that_changed_in_a_record_is_detected(tmp_path: Path) -> None:
+    artefacts.write_logs(tmp_path)
+    path = tmp_path / RECORDS
+    assert len(read_records(path)) == 5
+    path.write_text(path.read_text().replace('"steps":302', '"steps":312'))
+    with pytest.raises(UserError, match=r"line 3.* is not what was written"):
+        read_records(path)
+
+
+def test_records_saved_without_a_checksum_still_read(tmp_path: Path) -> None:
+    artefacts.write_logs(tmp_path)
+    path = tmp_path / RECORDS
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps({k: v for k, v in line.items() if k != "crc32"}) + "\n" for line in lines))
+    assert len(read_records(path)) == 5
+
+
+@pytest.mark.parametrize("value", ['"x"', "1e999", "true", "[1]", "9" * 400])
+def test_seconds_that_are_no_seconds_are_refused(tmp_path: Path, value: str) -> None:
+    artefacts.write_logs(tmp_path)
+    line = json.loads((tmp_path / RECORDS).read_text().splitlines()[0])
+    del line["crc32"]
+    line["seconds"]["sim"] = "HERE"
+    (tmp_path / RECORDS).write_text(json.dumps(line).replace('"HERE"', value) + "\n")
+    with pytest.raises(UserError, match=r"line 1.*seconds.sim"):
+        read_records(tmp_path / RECORDS)
+
+
+def test_an_endless_device_in_a_logs_place_is_refused(tmp_path: Path) -> None:
+    artefacts.write_logs(tmp_path)
+    for name in (RECORDS, "run.json"):
+        (tmp_path / name).unlink()
+        (tmp_path / name).symlink_to("/dev/zero")
+    with pytest.raises(UserError, match="not a file"):
+        read_records(tmp_path / RECORDS)
+    with pytest.raises(UserError, match="not a file"):
+        read_run(tmp_path)
+
+
+def test_notes_of_a_run_that_changed_are_detected(tmp_path: Path) -> None:
+    artefacts.write_logs(tmp_path)
+    path = tmp_path / "run.json"
+    path.write_text(path.read_text().replace('"cpu"', '"gpu"'))
+    with pytest.raises(UserError, match="not what was written"):
+        read_run(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "[", "[]", "null"])
+def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog) -> None:
+    artefacts.write_answers(tmp_path)
+    cached = next((tmp_path / "answers").rglob("*.json"))
+    cached.write_text(damage)
+    assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
+    assert "asked again" in caplog.text
+    cached.unlink()
+    cached.mkdir()
+    assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
+
+
+@pytest.mark.parametrize("record", ['"x"', '{"episode": 0}', '{"episode": 0, "seed": 1e3, "difficulty": "easy"}'])
+def test_metadata_of_another_form_is_refused(tmp_path: Path, record: str) -> None:
+    artefacts.write_metadata(tmp_path)
+    next(tmp_path.rglob("*.json")).write_text(f'{{"records": [{record}]}}')
+    with pytest.raises(UserError, match="not official metadata"):
+        metadata.episodes("PickXtimes", "test", tmp_path)
+
+
+def test_a_seal_does_not_depend_on_the_order_of_keys() -> None:
+    values = {"b": [1, 2.5, "\ud800"], "a": None}
+    assert verified(dict(reversed(with_checksum(values).items())), "x") == values
+    with pytest.raises(UserError, match="crc32"):
+        verified({**with_checksum(values), "a": 0}, "x")
+
+
+def test_states_well_beyond_the_statistics_are_a_broken_driver() -> None:
+    ones = np.ones(8)
+    stats = QuantileStats(mean=0 * ones, std=ones, q01=-ones, q99=ones)
+    check_reach(np.full((3, 8), 100, np.float32), stats, "a state")
+    with pytest.raises(UserError, match=r"1e\+30 for number 2 of 8.*within -1 and 1"):
+        check_reach(np.array([[0, 1e30, 0, 0, 0, 0, 0, 0]], np.float32), stats, "a state")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [(None, "must be a text"), (7, "must be a text"), ("a\ud800", "half a char")]
+)
+def test_a_prompt_that_is_no_text_is_refused(text: object, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        checked_text(text, "the goal")
+
+
+@pytest.mark.parametrize("goal", [None, b"pick", "pick \udfff"])
+def test_an_episode_begins_with_a_goal_in_words(goal: object) -> None:
+    from mme_vla.testing.small import small_policy
+
+    policy = small_policy("pi05")
+    with pytest.raises(UserError, match="the goal"):
+        policy.start_episode(goal)

@@ -1,0 +1,217 @@
+"""The vision cache: equal to the online history, resumable, and refused where it does not fit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from helpers import commands
+from helpers.h5_files import write_file
+from helpers.memory_fakes import WIDTH, LastFrames, encode
+from mme_vla.data import cache as store
+from mme_vla.data import cache_building as cache_build
+from mme_vla.data.cache import (
+    FINGERPRINT,
+    CacheMissingError,
+    VisionCache,
+    cache_folder,
+    fingerprint,
+    score_file,
+    token_file,
+)
+from mme_vla.data.cache_building import build_cache, clear_cache, ensure_cache, estimate
+from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import find_files, list_episodes
+from mme_vla.errors import UserError
+from mme_vla.memory.base import make_scorer
+from mme_vla.memory.history import OnlineHistory
+
+COMMAND = "mme-vla cache model=mine data=here"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> EpisodeSource:
+    folder = tmp_path_factory.mktemp("cache")
+    write_file(folder / "record_dataset_Alpha.h5", [30, 17, 8], videos=[6, 0, 2])
+    convert(list_episodes(find_files([folder])), folder / "out", ConvertOptions(images="png"))
+    return EpisodeSource(folder / "out")
+
+
+def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> VisionCache:
+    options = {"dtype": "float32", "batch_size": 3, "command": COMMAND, **options}
+    return ensure_cache(source, memory, encode, options.pop("encoder", "abc"), root=root, **options)
+
+
+@pytest.mark.parametrize("keep_every", [1, 4])
+@pytest.mark.parametrize("scored", [False, True])
+# In batches of other sizes MKL may add in another order.
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("bfloat16", 0)])
+def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype, tolerance) -> None:
+    memory = LastFrames(keep_every=keep_every, scored=scored)
+    cache = ensure(source, memory, tmp_path, dtype=dtype)
+    assert cache.width == WIDTH
+    for episode in range(3):
+        history = cache.history(episode)
+        online = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
+        for t in range(int(source.lengths[episode])):
+            frame = source.frames(episode, [t])
+            expected = frame[online.to_encode(1)]
+            tokens = encode(expected) if len(expected) else torch.zeros(0, 4, WIDTH)
+            online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
+            cached, streamed = memory.gather_selection(history, t), memory.gather_selection(online, t)
+            for one, other in zip(cached.tensors(), streamed.tensors(), strict=True):
+                torch.testing.assert_close(one, other, rtol=0, atol=tolerance)
+        assert (len(history), history.exec_start) == (len(online), online.exec_start)
+
+
+def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_path) -> None:
+    memory, calls = LastFrames(), []
+
+    def killed(frames: np.ndarray) -> torch.Tensor:
+        calls.append(len(frames))
+        if len(calls) == 12:  # within the second episode
+            raise KeyboardInterrupt
+        return encode(frames)
+
+    expected = fingerprint(source, memory.storage, "abc", "float32")
+    folder = cache_folder(tmp_path, source, expected)
+    with pytest.raises(KeyboardInterrupt):
+        build_cache(source, memory, killed, folder, expected, batch_size=3)
+    with pytest.raises(
+        CacheMissingError, match=rf"half-written: 2 of 3 episodes are missing. Finish it with: {COMMAND}$"
+    ):
+        VisionCache(folder, source, expected, COMMAND)
+    first = token_file(folder, 0).stat().st_mtime_ns
+    assert build_cache(source, memory, encode, folder, expected, batch_size=3) == 2
+    assert token_file(folder, 0).stat().st_mtime_ns == first
+    straight = ensure(source, memory, tmp_path / "whole")
+    resumed = VisionCache(folder, source, expected)
+    for episode in range(3):
+        assert np.array_equal(np.load(token_file(straight.folder, episode)), np.load(token_file(folder, episode)))
+    assert resumed.width == straight.width
+
+
+@pytest.mark.slow
+def test_drafts_of_a_killed_build_are_removed_by_the_next(source, tmp_path) -> None:
+    memory = LastFrames(scored=True)
+    build = tmp_path / "build.py"
+    build.write_text(
+        "import os, sys; from pathlib import Path; import numpy as np; from mme_vla.data.cache_building import _draft;"
+        "_draft(Path(sys.argv[1]), np.save, np.zeros(3)); os.kill(os.getpid(), 9)"
+    )
+    folder = cache_folder(tmp_path, source, expected := fingerprint(source, memory.storage, "abc", "float32"))
+    folder.mkdir(parents=True)
+    assert commands.run(str(build), str(token_file(folder, 0))).returncode == -9
+    assert len(list(folder.iterdir())) == 1
+    build_cache(source, memory, encode, folder, expected)
+    assert not [path for path in folder.iterdir() if path.name.endswith(".partial")]
+
+
+def test_processes_share_the_episodes(source, tmp_path, monkeypatch) -> None:
+    memory = LastFrames()
+    expected = fingerprint(source, memory.storage, "abc", "float32")
+    folder = cache_folder(tmp_path, source, expected)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    episodes = []
+    for rank in ("1", "0"):
+        monkeypatch.setenv("RANK", rank)
+        episodes.append(build_cache(source, memory, encode, folder, expected))
+    assert episodes == [1, 2]
+    VisionCache(folder, source, expected)
+
+
+def test_training_builds_small_caches_and_names_the_command_for_large_ones(source, tmp_path) -> None:
+    with pytest.raises(UserError, match=rf"There is no vision cache at .* {COMMAND} .*55 frames.*max_build_frames=54"):
+        ensure(source, LastFrames(), tmp_path, max_build_frames=54)
+    assert not any(tmp_path.iterdir())
+    ensure(source, LastFrames(), tmp_path, max_build_frames=55)
+    ensure(source, LastFrames(), tmp_path, max_build_frames=0)  # it is there now
+
+
+def test_other_encoders_poolings_and_data_have_other_folders(source, tmp_path) -> None:
+    folders = {
+        ensure(source, LastFrames(), tmp_path).folder,
+        ensure(source, LastFrames(), tmp_path, encoder="other").folder,
+        ensure(source, LastFrames(keep_every=4), tmp_path).folder,
+        ensure(source, LastFrames(scored=True), tmp_path).folder,
+        ensure(source, LastFrames(), tmp_path, dtype="bfloat16").folder,
+    }
+    assert len(folders) == 5
+
+
+def test_a_stale_cache_is_refused_with_the_command_that_mends_it(source, tmp_path) -> None:
+    cache = ensure(source, LastFrames(), tmp_path)
+    content = json.loads((cache.folder / FINGERPRINT).read_text())
+    (cache.folder / FINGERPRINT).write_text(json.dumps({**content, "encoder": "another"}))
+    with pytest.raises(UserError, match=rf"stale: encoder is 'another', expected 'abc'. .*{COMMAND} rebuild=true"):
+        ensure(source, LastFrames(), tmp_path)
+    assert token_file(cache.folder, 0).exists()
+
+
+def reshape(path: Path) -> None:
+    np.save(path, np.load(path)[:-1])
+
+
+def keep(count: int):
+    """Cut a file to its first bytes."""
+    return lambda path: path.write_bytes(path.read_bytes()[:count])
+
+
+def flip(path: Path) -> None:
+    path.write_bytes(b"".join(bytes([byte ^ 0xFF]) for byte in path.read_bytes()[:64]) + path.read_bytes()[64:])
+
+
+@pytest.mark.parametrize("damage", [keep(-100), keep(40), keep(0), flip, reshape])
+def test_a_damaged_token_file_is_refused(source, tmp_path, damage) -> None:
+    damage(token_file(ensure(source, LastFrames(), tmp_path).folder, 1))
+    with pytest.raises(UserError, match=rf"episode_000001.npy .*{COMMAND} rebuild=true"):
+        ensure(source, LastFrames(), tmp_path)
+
+
+@pytest.mark.parametrize("damage", [keep(-30), keep(10), keep(0), flip])
+def test_a_damaged_score_file_is_refused(source, tmp_path, damage) -> None:
+    memory = LastFrames(scored=True)
+    damage(score_file(ensure(source, memory, tmp_path).folder, 1))
+    with pytest.raises(UserError, match=rf"{score_file(tmp_path, 1).name} is damaged.*{COMMAND} rebuild=true"):
+        ensure(source, memory, tmp_path).history(1)
+
+
+def test_foreign_folders_are_neither_read_nor_cleared(source, tmp_path) -> None:
+    memory = LastFrames()
+    folder = cache_folder(tmp_path, source, fingerprint(source, memory.storage, "abc", "float32"))
+    folder.mkdir(parents=True)
+    (folder / "thesis.txt").write_text("years of work")
+    with pytest.raises(UserError, match="it is not a vision cache"):
+        ensure(source, memory, tmp_path)
+    with pytest.raises(UserError, match="nothing is removed"):
+        clear_cache(folder)
+
+
+def test_clearing_removes_the_cache_only(source, tmp_path) -> None:
+    folder = ensure(source, LastFrames(scored=True), tmp_path).folder
+    (folder / "notes.txt").write_text("mine")
+    clear_cache(folder)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_an_estimate_counts_frames_and_bytes_and_saves_nothing(source, tmp_path) -> None:
+    plan = estimate(source, LastFrames(keep_every=4), encode, "bfloat16")
+    n_frames = 8 + 5 + 3  # frame 0 and 3, 7, … of 30, 17 and 8
+    assert (plan.frames, plan.bytes) == (n_frames, n_frames * 4 * WIDTH * 2) and plan.seconds > 0
+
+
+def test_few_histories_stay_at_hand(source, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(store, "files_to_hold", lambda files: 2)
+    cache = ensure(source, LastFrames(), tmp_path)
+    for episode in (0, 1, 2, 0):
+        cache.history(episode)
+    assert list(cache._histories) == [2, 0]
+
+
+def test_an_encoder_of_another_grid_is_noticed(source, tmp_path) -> None:
+    with pytest.raises(ValueError, match="encode"):
+        ensure_cache(source, LastFrames(), lambda frames: encode(frames, grid=4), "abc", root=tmp_path)
+    assert cache_build.process_rank() == (0, 1)

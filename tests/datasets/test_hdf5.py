@@ -1,0 +1,91 @@
+"""Reading official HDF5 files."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from helpers.h5_files import write_file
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
+from mme_vla.errors import UserError
+
+
+def test_files_come_sorted_and_episodes_numerically(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Zeta.h5", [4])
+    write_file(tmp_path / "record_dataset_Alpha.h5", [4, 4, 4], numbers=[10, 2, 1])
+    refs = list_episodes(find_files([tmp_path]))
+    assert [(ref.task, ref.index) for ref in refs] == [("Alpha", 1), ("Alpha", 2), ("Alpha", 10), ("Zeta", 0)]
+
+
+def test_episode_fields_are_decoded(tmp_path: Path) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    (recorded,) = write_file(path, [12], videos=[5], numbers=[3])
+    with open_episode(EpisodeRef(path, 3, "Alpha")) as episode:
+        assert (len(episode), episode.exec_start, episode.seed, episode.difficulty) == (12, 5, 300, "easy")
+        assert episode.goals == ["do task 3", "another wording"]
+        frames = list(episode)
+    assert np.array_equal(np.stack([frame.state for frame in frames]), recorded.state)
+    assert np.array_equal(np.stack([frame.action for frame in frames]), recorded.actions)
+    assert np.array_equal(np.stack([frame.front for frame in frames]), recorded.front)
+    assert [frame.is_demo for frame in frames] == [True] * 5 + [False] * 7
+    assert frames[4].subgoals["grounded_subgoal_online"] == "pick up 1 at <1, 2> online"
+
+
+def test_subgoals_of_a_completed_task_stay_the_last_ones(tmp_path: Path) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [12])
+    with open_episode(EpisodeRef(path, 0, "Alpha")) as episode:
+        subgoals = [frame.subgoals["simple_subgoal"] for frame in episode]
+    assert subgoals[-3:] == ["pick up 2"] * 3
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda e: e.pop("timestep_3"), "without gaps"),
+        (lambda e: e["timestep_0"].pop("obs/wrist_rgb"), "lacks timestep_0/obs/wrist_rgb"),
+        (lambda e: e["timestep_4"].pop("action/joint_action"), "timestep_4/action/joint_action is damaged"),
+        (lambda e: e["timestep_5/info/is_video_demo"].write_direct(np.array(True)), "video frames must come first"),
+    ],
+)
+def test_a_damaged_episode_is_named(tmp_path: Path, damage, message: str) -> None:
+    path = tmp_path / "record_dataset_Alpha.h5"
+    write_file(path, [8])
+    with h5py.File(path, "a") as file:
+        damage(file["episode_0"])
+    with pytest.raises(UserError, match=message), open_episode(EpisodeRef(path, 0, "Alpha")) as episode:
+        list(episode)
+
+
+def test_what_is_no_demonstration_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes(b"not HDF5")
+    with pytest.raises(UserError, match="cannot be read as HDF5"):
+        list_episodes([tmp_path / "a.h5"])
+    h5py.File(tmp_path / "b.h5", "w").close()
+    with pytest.raises(UserError, match="no episode_<number> group"):
+        list_episodes([tmp_path / "b.h5"])
+    with pytest.raises(UserError, match="No HDF5 file at"):
+        find_files([tmp_path / "missing"])
+
+
+def test_a_folder_that_is_a_dataset_already_is_called_so(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    with pytest.raises(UserError, match=r"LeRobot dataset already.*hdf5="):
+        find_files([tmp_path])
+
+
+def test_official_files_are_read(h5_folder: Path) -> None:
+    episodes = {}
+    for ref in list_episodes(find_files([h5_folder])):
+        with open_episode(ref) as episode:
+            frame = next(iter(episode))
+            assert frame.front.shape == frame.wrist.shape == (256, 256, 3) and frame.front.dtype == np.uint8
+            assert frame.state.shape == frame.action.shape == (8,)
+            episodes[ref.task, ref.index] = (len(episode), episode.exec_start, episode.difficulty)
+    assert episodes == {
+        ("PatternLock", 8): (148, 74, "easy"),
+        ("PickXtimes", 8): (332, 0, "easy"),
+        ("VideoUnmask", 4): (263, 66, "easy"),
+    }

@@ -1,0 +1,158 @@
+"""The robot as a part: its YAML, what it refuses, what old checkpoints mean, and what its numbers become."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.config.composition import compose, config_dir
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
+from mme_vla.processing.processor import Processor
+from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
+from mme_vla.training import runs
+from mme_vla.utils import SUMS
+
+SHIPPED = sorted(path.stem for path in (config_dir() / "embodiment").glob("*.yaml"))
+TINY = {"vision": {**SMALL_VISION, "patch_size": 16}}
+
+
+def shipped(name: str) -> Embodiment:
+    section: Any = OmegaConf.to_container(compose("policy", [f"embodiment={name}"]).embodiment, resolve=True)
+    return Embodiment.from_dict(section)
+
+
+def section(**changes: Any) -> dict[str, Any]:
+    return {**ROBOMME_JOINT.to_dict(), **changes}
+
+
+def action(**changes: Any) -> dict[str, Any]:
+    return section(action={**ROBOMME_JOINT.action.to_dict(), **changes})
+
+
+def test_the_default_yaml_is_the_robot_of_old_checkpoints() -> None:
+    assert shipped("robomme_joint") == ROBOMME_JOINT
+    assert embodiment_of({}) == ROBOMME_JOINT
+    assert embodiment_of({"backbone": {"horizon": 10}}).action.horizon == 10
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> None:
+    robot = shipped(name)
+    assert robot.name == name
+    assert Embodiment.from_dict(json.loads(json.dumps(robot.to_dict()))) == robot
+    policy = build_policy("pi05", device="meta", embodiment=name)
+    assert policy.embodiment == robot and policy.backbone.config.horizon == robot.action.horizon
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (section(cameras={}), "at least one camera"),
+        (section(cameras={"front": {"augmnt": "all"}}), "Did you mean 'augment'"),
+        (section(cameras={"front": {"augment": "color"}}), "Did you mean 'colour'"),
+        (section(cameras={"state": {}}), "call the camera something else"),
+        (section(memory_camera="frnt"), "Did you mean 'front'"),
+        (section(state={"key": "state"}), "lacks the key 'width'"),
+        (section(fsp=20), "Did you mean 'fps'"),
+        (section(fps=0), "fps must be a positive number"),
+        (action(width=0), "action.width must be a positive"),
+        (action(relative=[8]), "relative must list numbers from 0 to 7"),
+        (action(relative=[1, 1]), "twice"),
+        (action(relative=7.5), "relative must list numbers"),
+        (action(angles={"roll": 3.1}), "number to centre"),
+        (action(angles={9: 3.1}), "angles must list numbers from 0 to 7"),
+        (action(names=["x"]), "names must hold 8 texts"),
+        (action(execute=21), "a chunk has 20 actions"),
+        (action(frames=2), "expected 1; null if"),
+    ],
+)
+def test_impossible_robots_are_refused_by_the_key(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        Embodiment.from_dict(options)
+
+
+def test_a_robot_and_a_network_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(UserError, match=r"8 numbers an action.*action_dim=4"):
+        build_policy("pi05", device="meta", backbone={"action_dim": 4})
+    with pytest.raises(UserError, match=r"embodiment.action.horizon=20 and backbone.horizon=5"):
+        build_policy("pi05", device="meta", backbone={"horizon": 5})
+
+
+def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_path: Path) -> None:
+    policy = build_policy("pi05", backbone=TINY)
+    policy.require_processor().stats = unit_stats()
+    policy.save_pretrained(tmp_path)
+    (tmp_path / SUMS).unlink()
+    file = tmp_path / "config.json"
+    config = json.loads(file.read_text())
+    assert config.pop("embodiment")["name"] == "robomme_joint"
+    file.write_text(json.dumps(config))
+    file = tmp_path / "processor.json"
+    settings = json.loads(file.read_text())
+    del settings["embodiment"]
+    file.write_text(json.dumps({**settings, "horizon": 20, "views": ["base_0_rgb", "left_wrist_0_rgb"]}))
+    loaded = MMEPolicy.from_pretrained(tmp_path)
+    assert loaded.embodiment == ROBOMME_JOINT and "embodiment" not in loaded.config
+    batch, noise = random_batch(policy), torch.zeros(2, 20, 32)
+    assert torch.equal(loaded.sample_actions(batch, noise, 2), policy.sample_actions(batch, noise, 2))
+
+
+def test_a_run_begun_before_robots_could_be_selected_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    config: Any = OmegaConf.to_container(compose("train", [f"output={tmp_path}"]), resolve=True)
+    old = {key: value for key, value in config.items() if key != "embodiment"}
+    checkpoint = tmp_path / "checkpoints" / "step_000001"
+    monkeypatch.setattr(runs, "resolve_checkpoint", lambda path: checkpoint)
+    monkeypatch.setattr(runs, "read_state", lambda path: {"config": old, "step": 1})
+    assert runs.open_run(tmp_path, str(checkpoint), config).step == 1
+    other: Any = OmegaConf.to_container(
+        compose("train", [f"output={tmp_path}", "embodiment=robomme_joint_absolute"]), resolve=True
+    )
+    with pytest.raises(UserError, match=r"embodiment\.action\.relative"):
+        runs.open_run(tmp_path, str(checkpoint), other)
+
+
+def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:
+    policy = build_policy("pi05", backbone=TINY, embodiment="robomme_waypoint")
+    policy.save_pretrained(tmp_path)
+    assert MMEPolicy.from_pretrained(tmp_path).embodiment == shipped("robomme_waypoint")
+    assert Processor.load(tmp_path).embodiment.action.horizon == 4
+
+
+def test_statistics_of_another_robot_are_refused() -> None:
+    policy = build_policy("pi05", backbone=TINY, embodiment="robomme_ee_pose")
+    with pytest.raises(UserError, match="are not those of 'robomme_ee_pose'"):
+        policy.require_processor().stats = unit_stats()
+
+
+def test_absolute_actions_stay_as_they_are_recorded() -> None:
+    space = shipped("robomme_joint_absolute").action
+    actions, state = torch.randn(3, 20, 8), torch.randn(3, 8)
+    assert torch.equal(space.to_relative(actions, state), actions)
+
+
+def test_angles_do_not_jump_and_the_gripper_of_a_waypoint_is_exactly_open_or_closed() -> None:
+    space = shipped("robomme_waypoint").action
+    recorded = torch.tensor(
+        [[0.1, 0.2, 0.3, math.pi - 0.01, 0.0, -0.1, -1.0], [0.1, 0.2, 0.3, 0.01 - math.pi, 0.0, 0.1, 1.0]]
+    )
+    predicted = space.to_relative(recorded[None], torch.zeros(1, 8))[0]
+    assert torch.allclose(predicted[:, 3], torch.tensor([math.pi - 0.01, math.pi + 0.01]), atol=1e-5)
+    assert torch.allclose(predicted[:, [0, 1, 2, 4, 5, 6]], recorded[:, [0, 1, 2, 4, 5, 6]], atol=1e-6)
+    noisy = predicted + 0.3
+    assert space.to_absolute(noisy[None], torch.zeros(1, 8))[0, :, 6].tolist() == [-1.0, 1.0]
+
+
+def test_only_robots_of_the_benchmark_can_be_evaluated_on_it() -> None:
+    spaces = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
+    for name in [name for name in SHIPPED if name.startswith("robomme")]:
+        check_benchmark(shipped(name), spaces)
+    with pytest.raises(UserError, match="its action space is None"):
+        check_benchmark(shipped("real_panda"), spaces)
+    with pytest.raises(UserError, match="has the cameras side"):
+        check_benchmark(Embodiment.from_dict(section(cameras={"front": {}, "side": {}})), spaces)

@@ -1,0 +1,111 @@
+"""Each of the 17 models trains on the embedded sample as `python -m mme_vla.train` does; recurrent ones resume."""
+
+import time
+from collections.abc import Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from mme_vla.cli.train import train
+from mme_vla.config.composition import compose
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.sources import open_sources
+from mme_vla.policy.tensor_files import load_tensors
+from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
+from mme_vla.training import data as training_data
+from mme_vla.training.logging import read_metrics
+
+pytestmark = pytest.mark.slow
+
+STEPS, WINDOW = 30, 6
+SMALL = [
+    "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2",
+    "backbone.vision.width=16", "backbone.vision.mlp_dim=16", "policy.augment=false", "logger=none",
+    "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=0",
+    "train.open_loop_chunks=0",
+]  # fmt: skip
+SHORT_MEMORY = {
+    "framesamp": ["memory.budget=64"],
+    "hybrid": ["memory.budget=64"],
+    "tokendrop": ["memory.budget=128"],
+    "ttt": ["memory.budget=128", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2"],
+    "rmt": ["memory.budget=64", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2"],
+    "retrieval": ["memory.budget=64"],
+    "moment": ["memory.budget=16", "memory.grid=4"],
+    "gist": ["memory.budget=48", "memory.anchors=1", "memory.recent=1"],
+    "actions": ["memory.max_steps=8", "memory.max_video=4"],
+    "learned_topk": ["memory.budget=48", "memory.pool=4"],
+    "spacetime": ["memory.frames=3", "memory.stride=4", "memory.state_dim=8"],
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def opened_once() -> Iterator[None]:
+    """Every run reads the same steps of the same files: open the sample once, and decode each image once."""
+    sources = open_sources(["sample"])
+    for source in sources:
+        _keep_images(source)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training_data, "open_sources", lambda names, robot: sources)
+        yield
+
+
+def _keep_images(source: EpisodeSource) -> None:
+    decode = source.frames
+
+    @cache
+    def image(episode: int, index: int, camera: str | None) -> np.ndarray:
+        return decode(episode, [index], camera)
+
+    def frames(episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
+        return image(episode, int(indices[0]), camera) if len(indices) == 1 else decode(episode, indices, camera)
+
+    source.frames = frames  # type: ignore[method-assign]
+
+
+@pytest.fixture(scope="module")
+def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Vision caches, shared by all models that store the same tokens."""
+    return tmp_path_factory.mktemp("caches")
+
+
+def run(model: str, folder: Path, caches: Path, *overrides: str) -> Path:
+    """Train in this process; the last checkpoint."""
+    memory = SHORT_MEMORY[model.rsplit("_", 1)[0]] if model in [*NEURAL, *BEYOND, "hybrid"] else []
+    cfg = compose("train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides])
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    return train(cfg, config, folder, begun=time.perf_counter())
+
+
+def losses(folder: Path) -> list[float]:
+    return [line["train/loss"] for line in read_metrics(folder) if "train/loss" in line]
+
+
+@pytest.mark.parametrize("model", [*ALL_MODELS, *BEYOND])
+def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Path) -> None:
+    run(model, tmp_path, caches, f"train.steps={STEPS}")
+    lines = read_metrics(tmp_path)
+    numbers = [value for line in lines for value in line.values()]
+    assert np.isfinite(numbers).all()
+    loss = losses(tmp_path)
+    assert len(loss) == STEPS
+    assert np.mean(loss[-WINDOW:]) < 0.5 * np.mean(loss[:WINDOW])
+    reported = {key for key in lines[-1] if key.startswith(("train/memory/", "memory/")) and key != "memory/gib"}
+    assert bool(reported) == (model in RECURRENT), "recurrent memories report what happens inside them"
+
+
+def test_a_recurrent_model_resumes_where_it_stopped(tmp_path: Path, caches: Path) -> None:
+    straight = run("ttt_modul", tmp_path / "whole", caches, "train.steps=12")
+    parts = tmp_path / "parts"
+    run("ttt_modul", parts, caches, "train.steps=6")
+    resumed = run("ttt_modul", tmp_path / "unused", caches, "train.steps=12", f"resume={parts}")
+    assert losses(parts) == losses(tmp_path / "whole")
+    assert len(losses(parts)) == 12
+    after = load_tensors(resumed)
+    for name, tensor in load_tensors(straight).items():
+        assert torch.equal(tensor, after[name]), name

@@ -1,0 +1,90 @@
+"""The shell of the project: pins, the two commands, and what must not be in the files."""
+
+import re
+import subprocess
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PACKAGE = REPOSITORY / "mme_vla"
+
+
+def pyproject() -> dict:
+    return tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+
+
+def test_pins_for_pip_and_for_uv_are_the_same() -> None:
+    lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    for_pip = {line.split("#")[0].strip() for line in lines} - {""}
+    for_uv = pyproject()["tool"]["uv"]["constraint-dependencies"]
+    assert for_pip == set(for_uv)
+    assert len(for_uv) == len(for_pip), "a pin stands twice"
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", pin) for pin in for_pip), "only name==version: no addresses, no ranges"
+
+
+def test_every_direct_dependency_is_pinned() -> None:
+    project = pyproject()["project"]
+    requirements = project["dependencies"] + [r for rs in project["optional-dependencies"].values() for r in rs]
+    pinned = {pin.split("==")[0] for pin in pyproject()["tool"]["uv"]["constraint-dependencies"]}
+    assert {re.match(r"[\w-]+", requirement)[0] for requirement in requirements} <= pinned
+
+
+def test_every_cap_gives_its_reason() -> None:
+    capped = [line for line in (REPOSITORY / "pyproject.toml").read_text().splitlines() if re.search(r'"[^"]+,<', line)]
+    assert capped
+    assert [line for line in capped if "#" not in line] == []
+
+
+def test_ci_runs_the_commands_of_the_readme() -> None:
+    pattern = r"^((?:pip install uv && .*|)uv run (?:--extra dev|python).*)$"
+    documented = re.findall(pattern, (REPOSITORY / "README.md").read_text(), re.MULTILINE)
+    run_by_ci = re.findall(r"^run '(.*)'$", (REPOSITORY / ".ci" / "run").read_text(), re.MULTILINE)
+    assert documented == run_by_ci
+    assert len(documented) == 3 and "-m slow" in documented[2]
+
+
+def test_links_in_the_documentation_lead_to_files() -> None:
+    broken = []
+    for page in [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("**/*.md")]:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text()):
+            if "://" not in target and not (page.parent / target).exists():
+                broken.append(f"{page.relative_to(REPOSITORY)} → {target}")
+    assert broken == []
+
+
+def test_no_file_names_a_place_on_somebodys_machine() -> None:
+    # Bracketed so that the pattern does not find itself.
+    places = re.compile(r"(?<![\w.~])/(?:wor[k]|roo[t]|hom[e]|User[s]|opt/\w+)/\w|index-ur[l]|find-link[s]|pypi\.or[g]")
+    hits = []
+    for file in project_files():
+        try:
+            text = file.read_text()
+        except UnicodeDecodeError:
+            continue
+        hits += [f"{file.relative_to(REPOSITORY)}: {hit[0]}" for hit in places.finditer(text)]
+    assert hits == []
+
+
+def test_every_exported_name_can_be_reached() -> None:
+    import mme_vla
+
+    assert set(mme_vla.__all__) <= set(dir(mme_vla))
+    assert all(getattr(mme_vla, name) is not None for name in mme_vla.__all__)
+    assert mme_vla.__version__ == pyproject()["project"]["version"]
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = mme_vla.nothing
+
+
+def project_files() -> Iterator[Path]:
+    """What git tracks or would track; without git, the package and what stands beside it."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard", "-z"], cwd=REPOSITORY, capture_output=True, text=True
+    )
+    if listed.returncode == 0:
+        yield from (REPOSITORY / name for name in listed.stdout.split("\0") if name and (REPOSITORY / name).is_file())
+    else:
+        for pattern in ("*.*", "mme_vla/**/*.*", "configs/**/*.*", "tests/**/*.*", "docs/**/*.*"):
+            yield from (file for file in REPOSITORY.glob(pattern) if file.is_file())

@@ -1,0 +1,156 @@
+"""InsertPeg: layout, near and far ends, what counts as grasped and inserted, and everything that fails."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+
+import numpy as np
+import pytest
+import sapien
+
+pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
+
+from helpers.env_cubes import steps_of_demonstration
+from helpers.env_unmask import make, texts, wait
+from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.scene.articulated import Peg
+from mme_vla.envs.scene.objects import at
+from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.subtasks import NO_RECORD
+from mme_vla.envs.tasks.insert_peg import InsertPeg
+
+GRASPING, INSERTING = 4, 5
+"""Indices of the execution's sub-tasks."""
+VIDEO_GRASPING, VIDEO_INSERTING = 0, 1
+OTHER = {"head": "tail", "tail": "head"}
+
+
+@pytest.fixture(scope="module")
+def made() -> Iterator[InsertPeg]:
+    env = make(InsertPeg, 13602, "medium")
+    yield env
+    env.close()
+
+
+@pytest.fixture(params=[("head", 1), ("head", -1), ("tail", 1), ("tail", -1)], ids=lambda p: f"{p[0]}{p[1]:+}")
+def env(made, request, monkeypatch) -> InsertPeg:
+    """At the grasp of the execution; whatever is in the air is in the hand."""
+    made.reset()
+    made.end, made.side = request.param
+    made.progress.subtasks[:] = made.subtasks()
+    made.progress.index = GRASPING
+    monkeypatch.setattr(made, "is_grasping", lambda thing: True)
+    return made
+
+
+def raise_peg(env: InsertPeg, peg: Peg, end: str) -> tuple[bool, bool]:
+    """Put a peg in the air below the tool, one end nearer to it than the other, and do a step."""
+    x = env.tcp_pose.p[0] + (0.0 if end == "head" else peg.length)
+    peg.move_to(at((x, 0.0), 0.2, 0.0))
+    return wait(env)
+
+
+def insert(env: InsertPeg, grasped: str, side: int, short: float = 0.0) -> tuple[bool, bool]:
+    """Put the end that is not grasped into the box, the tool on the given side of the box, and do a step."""
+    env.box.move_to(at((0.0, 0.1 * side), env.box.position[2], np.pi / 2))
+    along = -short if grasped == "tail" else env.peg.length + short
+    env.peg.move_to(env.box.pose * sapien.Pose([along, 0, 0]))
+    return wait(env)
+
+
+@pytest.mark.parametrize(("seed", "difficulty"), [(0, "easy"), (1, "medium"), (2, "hard"), (3, "easy"), (4, "hard")])
+def test_each_initialisation_draws_anew_and_the_second_counts(seed, difficulty):
+    env = make(InsertPeg, seed, difficulty)
+    stream = Draws(seed)
+    stream.uniform(), stream.uniform(), stream.uniforms(3), stream.integer(0, 3)
+    for _ in range(2):
+        box = [(stream.uniform() - 0.5) * 0.2 for _ in range(2)]
+        box_yaw = np.radians(90 + 20 * (2 * stream.uniform() - 1))
+        pegs: list[tuple[list[float], float]] = []
+        while len(pegs) < 3:
+            xy = [(stream.uniform() - 0.5) * 0.4, (stream.uniform() - 0.5) * 0.6]
+            if np.hypot(*np.subtract(xy, box)) > 0.06 and all(np.hypot(*np.subtract(xy, p)) > 0.075 for p, _ in pegs):
+                pegs.append((xy, np.radians(90 * stream.uniform() - 45)))
+        end, side = ("head", "tail")[stream.integer(0, 2)], (-1, 1)[stream.integer(0, 2)]
+    for thing, (xy, yaw), z in zip([env.box, *env.pegs], [(box, box_yaw), *pegs], [0.04, 0, 0, 0], strict=True):
+        pose = thing.initial_pose
+        np.testing.assert_allclose(pose.p, [*xy, z], atol=1e-6)
+        assert 2 * np.arctan2(pose.q[3], pose.q[0]) == pytest.approx(yaw, abs=1e-5)
+    assert (env.end, env.side) == (end, side) and env.peg is env.pegs[0]
+    env.close()
+
+
+def test_texts_name_the_end_from_the_robot_and_the_side(env):
+    grasped, free = env.ends(env.end)
+    word = "near" if grasped.position[0] < free.position[0] else "far"
+    grasp = f"Pick up the peg by grasping the {word} end"
+    side, letter = ("right", "b") if env.side == 1 else ("left", "c")
+    insertion = f"Insert the peg from the {side} side"
+    assert texts(env) == [
+        (grasp, f"{grasp} at <>", "a"), (f"{insertion} of the box", f"{insertion} of the box at <>", letter),
+        (NO_RECORD, NO_RECORD, ""), (NO_RECORD, NO_RECORD, ""),
+        (grasp, f"{grasp} at <>", "a"), (insertion, f"{insertion} at <>", letter),
+    ]  # fmt: skip
+    assert [step.video for step in env.progress.subtasks] == [True] * 4 + [False] * 2
+    assert len(env.goals()) == 2 and [choice.needs_point for choice in env.choices()] == [True, False, False]
+
+
+def test_the_right_end_up_and_the_other_in_from_the_right_side_is_success(env):
+    assert raise_peg(env, env.peg, env.end) == (False, False) and env.progress.index == INSERTING
+    assert insert(env, env.end, env.side, short=0.06) == (False, False)
+    assert insert(env, env.end, env.side) == (True, False)
+
+
+def test_an_insertion_is_displayed_in_red_for_twenty_steps_after_it(env):
+    hidden = env._red_disc.position[2]
+    env.progress.index = INSERTING
+    insert(env, env.end, env.side)
+    assert env._red_disc.position[2] > 0
+    env.peg.restore()
+    wait(env, 20)
+    assert env._red_disc.position[2] > 0
+    wait(env)
+    assert env._red_disc.position[2] == hidden < 0
+
+
+def test_the_wrong_end_up_fails_but_not_in_the_video(env):
+    env.progress.index = VIDEO_GRASPING
+    assert raise_peg(env, env.peg, OTHER[env.end]) == (False, False) and env.progress.index == VIDEO_GRASPING
+    env.progress.index = GRASPING
+    assert raise_peg(env, env.peg, OTHER[env.end]) == (False, True)
+
+
+@pytest.mark.parametrize("stage", [GRASPING, INSERTING])
+def test_another_peg_in_the_hand_fails(env, stage):
+    env.progress.index = stage
+    assert raise_peg(env, env.pegs[2], env.end) == (False, True)
+
+
+def test_the_wrong_end_in_the_box_fails(env):
+    env.progress.index = INSERTING
+    assert insert(env, OTHER[env.end], env.side) == (False, True)
+
+
+def test_from_the_other_side_fails_but_not_in_the_video(env):
+    env.progress.index = VIDEO_INSERTING
+    assert insert(env, env.end, -env.side) == (False, False) and env.progress.index == VIDEO_INSERTING
+    env.progress.index = INSERTING
+    assert insert(env, env.end, -env.side) == (False, True)
+
+
+def test_on_the_way_back_from_the_video_the_pegs_are_where_they_were(env):
+    raise_peg(env, env.peg, env.end)
+    env.reset_in_progress = True
+    wait(env)
+    for peg in env.pegs:
+        np.testing.assert_allclose(peg.pose.p, peg.initial_pose.p, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [710002, 9000005, 9000014], ids=["beside the box", "flung off", "out of reach"])
+def test_where_the_official_demonstrator_fails_the_local_one_retries(seed: int):
+    env = make(InsertPeg, seed, "easy")
+    assert steps_of_demonstration(env) is not None
+    env.second_tries = False
+    env.reset()
+    with suppress(PlanningError):
+        assert steps_of_demonstration(env) is None
+    env.close()

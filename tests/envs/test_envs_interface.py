@@ -1,0 +1,411 @@
+"""The environment's contract: lists, infos, statuses, step counting, the conditioning video, errors."""
+
+import gc
+import json
+import sys
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
+h5py = pytest.importorskip("h5py")
+
+from mme_vla.envs import (  # noqa: E402
+    make,
+    make_env,
+    rendering,
+)
+from mme_vla.envs.grounding import Grounding, centroid, ground, project  # noqa: E402
+from mme_vla.envs.observations import AngleTrack, front_extrinsic  # noqa: E402
+from mme_vla.envs.robot.control import PlanningError  # noqa: E402
+from mme_vla.errors import UserError  # noqa: E402
+
+STILL = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
+MakeEnv = Callable[..., Any]
+
+
+@pytest.fixture
+def make_unrendered() -> Iterator[MakeEnv]:
+    made = []
+
+    def build(task: str = "PickXtimes", split: str = "train", episode: int = 8, *args: Any, **options: Any) -> Any:
+        made.append(make_env(task, split, episode, *args, **{"render": False} | options))
+        return made[-1]
+
+    yield build
+    for env in made:
+        env.close()
+
+
+def test_a_closed_environment_gives_its_scene_up_at_once(make_unrendered) -> None:
+    env = make_unrendered()
+    env.reset()
+    scene = weakref.ref(env._task.scene.sub_scenes[0])
+    gc.disable()
+    try:
+        env.close()
+        assert scene() is None
+    finally:
+        gc.enable()
+
+
+def official_steps(h5_folder: Path, task: str) -> tuple[int, list[Any], list[Any], Any]:
+    """Number of the first given episode, its video frames, its execution frames and its setup."""
+    path = h5_folder / f"record_dataset_{task}.h5"
+    if not path.is_file():
+        pytest.skip(f"no official episode of {task} in {h5_folder}")
+    file = h5py.File(path)
+    name = min(file)
+    group = file[name]
+    steps = [group[f"timestep_{k}"] for k in range(sum(key.startswith("timestep_") for key in group))]
+    video = [step for step in steps if step["info/is_video_demo"][()]]
+    return int(name.removeprefix("episode_")), video, steps[len(video) :], group["setup"]
+
+
+# Against official episodes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["PickXtimes", "VideoUnmask", "PatternLock"])
+def test_recorded_joint_actions_succeed_with_the_recorded_texts_and_states(
+    h5_folder: Path, make_unrendered: MakeEnv, task: str
+) -> None:
+    episode, _, execution, setup = official_steps(h5_folder, task)
+    included = {"include_wrist_camera_extrinsic": True, "include_available_multi_choices": True}
+    env = make_unrendered(task, "train", episode, **included)
+    env.task.recording = True  # drops are judged as when the episode was recorded
+    observation, info = env.reset()
+    assert info["task_goal"] == [goal.decode() for goal in setup["task_goal"][()]]
+    assert info["available_multi_choices"] == json.loads(setup["available_multi_choices"][()])
+    for step in execution:
+        observation, _, terminated, _, info = env.step(step["action/joint_action"][()])
+        for key in ("joint_state", "eef_state", "gripper_state", "wrist_camera_extrinsic"):
+            (actual,) = observation[f"{key}_list"]
+            np.testing.assert_allclose(actual, step[f"obs/{key}"][()], atol=1e-3, err_msg=key)
+        assert info["simple_subgoal_online"] == step["info/simple_subgoal_online"][()].decode()
+        if terminated:
+            break
+    assert info["status"] == "success"
+
+
+@pytest.mark.parametrize("space", ["ee_pose", "waypoint", "multi_choice"])
+def test_recorded_actions_of_the_other_spaces_succeed(h5_folder: Path, make_unrendered: MakeEnv, space: str) -> None:
+    episode, _, execution, _ = official_steps(h5_folder, "VideoUnmask")
+    if space == "multi_choice":
+        at_boundary = [step for step in execution if step["info/is_subgoal_boundary"][()]]
+        actions: list[Any] = [json.loads(step["action/choice_action"][()]) for step in at_boundary]
+    else:
+        name = {"ee_pose": "eef_action", "waypoint": "waypoint_action"}[space]
+        rows = [row for row in (step[f"action/{name}"][()] for step in execution) if np.isfinite(row).all()]
+        same = [space == "waypoint" and k > 0 and np.array_equal(rows[k - 1], row) for k, row in enumerate(rows)]
+        actions = [row for row, repeated in zip(rows, same, strict=True) if not repeated]
+    env = make_unrendered("VideoUnmask", "train", episode, space)
+    env.reset()
+    for action in actions:
+        observation, _, terminated, _, info = env.step(action)
+        assert len(observation["joint_state_list"]) == 1 or space != "ee_pose"
+        if terminated:
+            break
+    assert info["status"] == "success", info
+
+
+def test_the_video_comes_first_and_equals_the_recorded_one(h5_folder: Path, make_unrendered: MakeEnv) -> None:
+    episode, video, _, _ = official_steps(h5_folder, "VideoUnmask")
+    env = make_unrendered("VideoUnmask", "train", episode)
+    frames: list[tuple[str, bool]] = []
+    env.on_frame = lambda frame, info, in_video: frames.append((info["simple_subgoal_online"], in_video))
+    observation, _ = env.reset()
+    assert len(observation["joint_state_list"]) == len(video) + 1
+    assert frames[:-1] == [(step["info/simple_subgoal_online"][()].decode(), True) for step in video]
+    assert frames[-1][1] is False
+    for actual, step in zip(observation["joint_state_list"], video, strict=False):
+        np.testing.assert_allclose(actual, step["obs/joint_state"][()], atol=1e-5)
+
+
+def test_the_stick_s_video_leaves_out_what_is_not_recorded(make_unrendered: MakeEnv) -> None:
+    env = make_unrendered("PatternLock", "train", 8)
+    texts: list[str] = []
+    env.on_frame = lambda frame, info, in_video: texts.append(info["simple_subgoal_online"])
+    observation, info = env.reset()
+    assert len(texts) == len(observation["joint_state_list"])
+    assert "NO RECORD" not in texts
+    assert env.task.steps_done > len(texts)
+    np.testing.assert_allclose(observation["joint_state_list"][-1], env.task.stored_qpos, atol=0.01)
+    assert info["simple_subgoal_online"].startswith("move ")
+
+
+# The contract -----------------------------------------------------------------------------------------------------
+
+
+def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered: MakeEnv) -> None:
+    env = make_unrendered(include_front_camera_extrinsic=True, include_front_camera_intrinsic=True)
+    first, info = env.reset()
+    assert {key: len(value) for key, value in first.items()} == dict.fromkeys(first, 1)
+    observation, reward, terminated, truncated, info = env.step(STILL)
+    dtypes = {key: (value[0].dtype.name, value[0].shape) for key, value in observation.items()}
+    assert dtypes == {
+        "joint_state_list": ("float32", (7,)),
+        "eef_state_list": ("float64", (6,)),
+        "gripper_state_list": ("float32", (2,)),
+        "front_camera_extrinsic_list": ("float32", (3, 4)),
+    }
+    assert (reward.shape, terminated.shape, truncated.shape) == ((), (), ())
+    assert set(info) == {
+        "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "status", "success", "fail", "elapsed_steps",
+        "front_camera_intrinsic",
+    }  # fmt: skip
+    assert info["status"] == "ongoing"
+    assert info["elapsed_steps"].tolist() == [2]
+    assert info["grounded_subgoal_online"] == info["simple_subgoal_online"]
+
+
+def test_multi_choice_provides_what_is_needed_to_choose(make_unrendered: MakeEnv) -> None:
+    env = make_unrendered("PickXtimes", "train", 8, "multi_choice", include_front_camera_extrinsic=False)
+    observation, info = env.reset()
+    assert "front_camera_extrinsic_list" in observation
+    assert info["front_camera_intrinsic"].shape == (3, 3)
+    with pytest.warns(UserWarning, match="Unknown choice"):
+        observation, _, terminated, truncated, info = env.step({"choice": "q"})
+    assert all(frames == [] for frames in observation.values())
+    assert (bool(terminated), bool(truncated), info["status"]) == (False, False, "ongoing")
+
+
+def test_the_limit_counts_two_steps_more(make_unrendered: MakeEnv) -> None:
+    env = make_unrendered("VideoUnmask", "train", 4, max_steps=5)
+    env.reset()
+    assert env.steps_counted == 1
+    statuses = []
+    for _ in range(6):
+        _, _, _, truncated, info = env.step(STILL)
+        statuses.append((info["status"], bool(truncated)))
+    assert statuses == [("ongoing", False)] * 5 + [("timeout", True)]
+
+
+@pytest.mark.parametrize("action", [STILL[:6], np.full(8, np.nan), None, "up", [[0.0] * 8]])
+def test_a_malformed_action_is_an_error_status(make_unrendered: MakeEnv, action: Any) -> None:
+    env = make_unrendered()
+    env.reset()
+    observation, reward, terminated, truncated, info = env.step(action)
+    assert (observation, reward, terminated, truncated) == (None, 0.0, True, False)
+    assert info["status"] == "error"
+    assert info["exception_type"] == "UserError"
+    assert env.step(STILL)[4]["status"] == "ongoing"
+
+
+def test_an_unreachable_pose_is_an_error_status(make_unrendered: MakeEnv) -> None:
+    unreachable = [3.0, 0.0, 0.5, np.pi, 0.0, 0.0, 1.0]
+    env = make_unrendered("PickXtimes", "train", 8, "ee_pose")
+    env.reset()
+    observation, _, terminated, _, info = env.step(unreachable)
+    assert (observation, terminated, info["status"]) == ({}, True, "error")
+    assert "IK failed" in info["error_message"]
+
+
+def test_a_motion_that_cannot_be_planned_is_an_error_status(
+    make_unrendered: MakeEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make_unrendered("PickXtimes", "train", 8, "waypoint")
+    env.reset()
+
+    def fail(*_: Any) -> None:
+        raise PlanningError("no way")
+
+    monkeypatch.setattr(type(env._run.control.demonstrator), "move_to", fail)
+    observation, _, terminated, _, info = env.step([0.0, 0.0, 0.3, np.pi, 0.0, 0.0, 1.0])
+    assert (observation, terminated, info["exception_type"]) == (None, True, "PlanningError")
+
+
+def test_one_unplanned_video_motion_does_not_stop_the_video(
+    make_unrendered: MakeEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make_unrendered("VideoUnmask", "train", 4)
+
+    def fail(*_: Any) -> None:
+        raise PlanningError("no way")
+
+    monkeypatch.setattr("mme_vla.envs.robot.control.RobotControl.hold", fail)
+    observation, info = env.reset()
+    assert len(observation["joint_state_list"]) == 1
+    assert info["status"] == "ongoing"
+
+
+def test_a_closed_or_unstarted_environment_says_so(make_unrendered: MakeEnv) -> None:
+    env = make_unrendered()
+    with pytest.raises(UserError, match="call reset"):
+        env.step(STILL)
+    env.close()
+    env.close()
+    for use in (env.reset, lambda: env.step(STILL), env.render):
+        with pytest.raises(UserError, match="closed"):
+            use()
+
+
+def test_resets_and_environments_repeat_bit_for_bit(make_unrendered: MakeEnv) -> None:
+    def run(env: Any) -> list[np.ndarray]:
+        env.reset()
+        rng = np.random.default_rng(0)
+        for _ in range(40):
+            env.step(STILL + np.append(rng.normal(0, 0.3, 7), 0))
+        return [env.task.get_state().numpy().copy()]
+
+    env = make_unrendered("VideoUnmask", "train", 4)
+    first, second, other = run(env), run(env), run(make_unrendered("VideoUnmask", "train", 4))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(first, other)
+
+
+# Making -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"task": "PickXTimes"}, "Did you mean 'PickXtimes'"),
+        ({"task": "PickXtimes", "split": "eval"}, "Unknown split"),
+        ({"task": "PickXtimes", "episode": 50}, "expected 0 to 49"),
+        ({"task": "PickXtimes", "action_space": "joint"}, "Unknown action space"),
+        ({"task": "PickXtimes", "env": "robomme"}, "Unknown environment"),
+        ({"task": "PickXtimes", "include_depth": True}, "include_front_depth"),
+        ({"task": "PickXtimes", "include_front_depth": "yes"}, "True or False"),
+        ({"task": "PickXtimes", "difficulty": "easy"}, "needs a seed"),
+        ({"task": "PickXtimes", "seed": 1, "difficulty": "tough"}, "Unknown difficulty"),
+        ({"task": "PickXtimes", "max_steps": 0, "render": False}, "positive integer"),
+    ],
+)
+def test_unknown_names_are_refused_with_what_exists(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        make_env(**arguments)
+
+
+def test_a_missing_simulator_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(make, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="uv sync --inexact --extra sim"):
+        make_env("PickXtimes", render=False)
+
+
+SUMMARY = "GPU: llvmpipe (LLVM 15)\n  Supported: {}\n  Present:   0\n"
+
+
+@pytest.mark.parametrize(
+    ("summary", "mesa", "words"),
+    [(None, 25, "cannot render"), (SUMMARY.format(0), 25, "new enough"), (SUMMARY.format(1), 22, "too old")],
+)
+def test_missing_or_old_vulkan_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, summary: str | None, mesa: int, words: str
+) -> None:
+    def describe() -> str:
+        if summary is None:
+            raise RuntimeError("failed to find a rendering device")
+        return summary
+
+    def device(name: str) -> Any:
+        raise RuntimeError(f'failed to find device "{name}"')
+
+    fake = SimpleNamespace(render=SimpleNamespace(get_device_summary=describe), Device=device)
+    monkeypatch.setitem(sys.modules, "sapien", fake)  # type: ignore[arg-type]
+    monkeypatch.setattr(rendering, "mesa_version", lambda: mesa)
+    rendering.render_backend.cache_clear()
+    with pytest.raises(UserError, match=f"{words}[\\s\\S]*install_vulkan.sh"):
+        rendering.render_backend()
+    rendering.render_backend.cache_clear()
+
+
+class _Builder:
+    """Stands for the official package's builder."""
+
+    made: dict[str, Any]
+
+    def __init__(self, **arguments: Any) -> None:
+        type(self).made = arguments
+
+    def get_episode_num(self) -> int:
+        return 3
+
+    def make_env_for_episode(self, episode: int, max_steps: int | None = None, **include: bool) -> Any:
+        type(self).made |= {"episode": episode, "limit": max_steps, **include}
+        frame = np.zeros((256, 256, 3), np.uint8)
+        observation_ = {"front_rgb_list": [frame, frame + 1]}
+        outcome = (observation_, 0.0, False, False, {"task_goal": "press the button", "status": "ongoing"})
+        return SimpleNamespace(
+            reset=lambda: (observation_, {"task_goal": ["press the button"]}),
+            step=lambda action: outcome,
+            close=lambda: None,
+        )
+
+
+def test_the_official_package_comes_through_the_same_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UserError, match="robomme is not installed"):
+        make_env("StopCube", env="official")
+    wrapper = ModuleType("robomme.env_record_wrapper")
+    wrapper.BenchmarkEnvBuilder = _Builder  # type: ignore[attr-defined]
+    package, tasks = ModuleType("robomme"), ModuleType("robomme.robomme_env")
+    package.__spec__ = SimpleNamespace(name="robomme", submodule_search_locations=[])  # type: ignore[assignment]
+    for module in (package, wrapper, tasks):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    with pytest.raises(UserError, match="expected 0 to 2"):
+        make_env("StopCube", episode=3, env="official")
+    with pytest.raises(UserError, match="leave out seed"):
+        make_env("StopCube", seed=3, env="official")
+    env = make_env("StopCube", "val", 2, "waypoint", env="official", max_steps=7, include_front_depth=True)
+    assert _Builder.made == {
+        "env_id": "StopCube", "dataset": "val", "action_space": "waypoint", "gui_render": False, "max_steps": 7,
+        "episode": 2, "limit": 7, "include_front_depth": True,
+    }  # fmt: skip
+    with pytest.raises(UserError, match="call reset"):
+        env.step([0] * 7)
+    observation, _ = env.reset()
+    assert len(observation["front_rgb_list"]) == 2
+    assert env.step([0] * 7)[4]["task_goal"] == ["press the button"]
+    assert env.render().max() == 1
+    env.close()
+    with pytest.raises(UserError, match="closed"):
+        env.reset()
+
+
+# Parts ------------------------------------------------------------------------------------------------------------
+
+
+def test_angles_exceed_half_a_rotation() -> None:
+    from scipy.spatial.transform import Rotation
+
+    track = AngleTrack()
+    yaws = np.linspace(3.0, 7.0, 30)
+    quaternions = [Rotation.from_euler("xyz", [np.pi, 0, yaw]).as_quat(scalar_first=True) for yaw in yaws]
+    angles = np.array([track.follow(q * (-1) ** k) for k, q in enumerate(quaternions)])
+    np.testing.assert_allclose(np.diff(angles[:, 2]), np.diff(yaws), atol=1e-6)
+    assert np.abs(np.diff(angles[:, :2])).max() < 7
+    track.clear()
+    assert abs(track.follow(quaternions[-1])[2]) <= np.pi
+
+
+def test_the_front_camera_is_the_official_one() -> None:
+    expected = [[0, 1, 0, 0], [0.894427, 0, -0.447214, -0.089443], [-0.447214, 0, -0.894427, 0.491935]]
+    np.testing.assert_allclose(front_extrinsic(), expected, atol=2e-6)
+    np.testing.assert_allclose(project(np.array([0.0, 0.0, -0.2])), [128, 128], atol=1e-4)
+    assert project(np.array([0.0, 0.1, 0.0]))[1] > 128
+
+
+class _Thing:
+    def __init__(self, *ids: int) -> None:
+        self.segmentation_ids = list(ids)
+
+
+def test_a_text_is_grounded_once_its_objects_are_visible() -> None:
+    segmentation = np.zeros((256, 256), np.int16)
+    segmentation[10:13, 20:24] = 5
+    assert centroid(segmentation, [5]) == (11, 21)
+    assert centroid(segmentation, [6]) is None
+    assert ground("at <> to <>", [_Thing(5), _Thing(6)], segmentation) is None  # type: ignore[list-item]
+    assert ground("at <>", [_Thing(5), _Thing(6)], segmentation) == "at <11, 21>"  # type: ignore[list-item]
+    with pytest.raises(ValueError, match="2 places for 1"):
+        ground("at <> to <>", [_Thing(5)], segmentation)  # type: ignore[list-item]
+    subtask: Any = SimpleNamespace(text="pick", grounded_text="pick at <>", targets=[_Thing(5)])
+    empty = np.zeros_like(segmentation)
+    retrying, once = Grounding(), Grounding(retry=False)
+    texts = [retrying.update(subtask, lambda p=p: p) for p in (empty, segmentation, empty)]
+    assert texts == ["pick", "pick at <11, 21>", "pick at <11, 21>"]
+    assert [once.update(subtask, lambda p=p: p) for p in (empty, segmentation)] == ["pick", "pick"]

@@ -1,0 +1,179 @@
+"""MoveCube: layout of video and execution, the three manners, and what fails in each."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import sapien
+
+pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
+
+from helpers.env_cubes import read_cube, read_disc, steps_of_demonstration
+from helpers.env_unmask import make, texts, wait
+from mme_vla.envs.scene.objects import H
+from mme_vla.envs.scene.placement import Draws, Region
+from mme_vla.envs.scene.things import Thing, distance_xy
+from mme_vla.envs.subtasks import NO_RECORD
+from mme_vla.envs.tasks.move_cube import MANNERS, MoveCube
+
+HOOK, PUSH, GRASP = 5, 3, 0  # seeds
+PICK_PEG, HOOK_CUBE = "Pick up the peg", "Hook the cube to the target with the peg"
+PUSH_CUBE = "Close the gripper and push the cube to the target"
+PICK_CUBE, PLACE_CUBE = "Pick up the cube", "place the cube onto the target"
+
+
+@pytest.fixture(scope="module")
+def tasks() -> Iterator[Callable[[int], MoveCube]]:
+    made: dict[int, MoveCube] = {}
+
+    def of(seed: int) -> MoveCube:
+        made.setdefault(seed, make(MoveCube, seed, "easy")).reset()
+        return made[seed]
+
+    yield of
+    for env in made.values():
+        env.close()
+
+
+def begin(env: MoveCube, monkeypatch: pytest.MonkeyPatch, text: str) -> list[Thing]:
+    """Go to a sub-task of the execution with nothing in the hand; what is put into the list is held."""
+    steps = env.progress.subtasks
+    env.progress.index = next(i for i, step in enumerate(steps) if step.text == text and not step.video)
+    in_hand: list[Thing] = []
+    monkeypatch.setattr(env, "is_grasping", lambda thing: thing in in_hand)
+    return in_hand
+
+
+def put(thing: Thing, place: np.ndarray, aside: float = 0.0, z: float = H) -> None:
+    thing.move_to(sapien.Pose([place[0] + aside, place[1], z], thing.pose.q))
+
+
+def lift(env: MoveCube, in_hand: list[Thing], thing: Thing, parts: list[Thing]) -> tuple[bool, bool]:
+    in_hand += parts
+    put(thing, thing.position, z=0.2)
+    return wait(env)
+
+
+def read_peg(stream: Draws) -> tuple[float, float, float]:
+    side = -0.2 if stream.uniform() < 0.5 else 0.2
+    x, y = ((stream.uniform() - 0.5) * 0.1 for _ in range(2))
+    return x, side + y, np.radians(stream.uniform() * 90 - 45)
+
+
+def peg_of(pose: sapien.Pose) -> tuple[float, float, float]:
+    return pose.p[0], pose.p[1], 2 * np.arctan2(pose.q[3], pose.q[0])
+
+
+def skip_centre(stream: Draws, goal: np.ndarray) -> Region:
+    while True:
+        centre = ((stream.uniform() - 0.5) * 0.2, (stream.uniform() - 0.5) * 0.2)
+        if np.hypot(centre[0] - goal[0], centre[1] - goal[1]) > 0.1:
+            return Region(centre, 0.05)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5])
+@pytest.mark.parametrize("difficulty", ["easy", "hard"])
+def test_video_and_execution_come_from_the_stream_in_order(seed, difficulty):
+    env = make(MoveCube, seed, difficulty)
+    stream = Draws(seed)
+    stream.uniform(), stream.uniform()
+    pegs = [read_peg(stream) for _ in range(2)]
+    stream.integer(0, 2), stream.integer(0, 2)
+    poses = (env.peg.initial_pose, env.target.initial_pose, env.cube.initial_pose)
+    env.reset_in_progress = True
+    wait(env)
+    env.reset_in_progress = False
+    assert peg_of(poses[0]) == pytest.approx(pegs[0], abs=1e-5)
+    assert peg_of(env.peg.pose) == pytest.approx(pegs[1], abs=1e-5)
+    read_disc(stream, Region((0, 0), 0.15), env.target)
+    env.target.set_home(env.target.pose)
+    read_disc(stream, Region((0, 0), 0.1), env.target)
+    read_cube(stream, skip_centre(stream, poses[1].p), env.cube)
+    assert distance_xy(poses[2].p, poses[1].p) > 0.1 - 0.03 * np.sqrt(2)
+    env.cube.set_home(env.cube.pose)
+    read_cube(stream, skip_centre(stream, env.target.position), env.cube)
+    stream.integer(0, 3)  # the first initialisation's
+    assert env.manner == MANNERS[stream.integer(0, 3)]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("seed", "expected"),
+    [
+        (HOOK, [(PICK_PEG, f"{PICK_PEG} at <>", "a"),
+                (HOOK_CUBE, "Hook the cube at <> to the target at <> with the peg", "b")]),
+        (PUSH, [(PUSH_CUBE, "Close the gripper and push the cube at <> to the target at <>", "c")]),
+        (GRASP, [(PICK_CUBE, f"{PICK_CUBE} at <>", "d"), (PLACE_CUBE, f"{PLACE_CUBE} at <>", "e")]),
+    ],
+)  # fmt: skip
+def test_the_execution_says_what_the_video_says(tasks, seed, expected):
+    env = tasks(seed)
+    assert texts(env) == [*expected, ("static",) * 2 + ("",), (NO_RECORD,) * 2 + ("",), *expected]
+    assert [step.video for step in env.progress.subtasks] == [True] * (len(expected) + 2) + [False] * len(expected)
+    assert env.goals() == [
+        f"watch the video carefully, then move the cube to the target in the same manner {end}"
+        for end in ("as before", "shown in the video")
+    ]
+
+
+def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(tasks, monkeypatch):
+    env = tasks(HOOK)
+    in_hand = begin(env, monkeypatch, PICK_PEG)
+    assert lift(env, in_hand, env.peg, [env.peg.tail]) == (False, False) and env.progress.index == 5
+    put(env.cube, env.target.position, aside=0.055)
+    assert wait(env) == (False, False)
+    put(env.cube, env.target.position, aside=0.04)
+    assert wait(env) == (True, False)
+
+
+def test_pushing_counts_once_the_gripper_opens(tasks, monkeypatch):
+    env = tasks(PUSH)
+    begin(env, monkeypatch, PUSH_CUBE)
+    closed = np.append(env.reset_action[:7], -1).astype(np.float32)
+    for _ in range(5):
+        env.step(closed)
+    put(env.cube, env.target.position, aside=0.04)
+    env.step(closed)
+    assert not env.progress.succeeded
+    assert wait(env, 5) == (True, False)
+
+
+def test_grasping_and_placing_is_success(tasks, monkeypatch):
+    env = tasks(GRASP)
+    in_hand = begin(env, monkeypatch, PICK_CUBE)
+    assert lift(env, in_hand, env.cube, [env.cube]) == (False, False) and env.progress.index == 5
+    put(env.cube, env.target.position, aside=0.04)
+    assert wait(env) == (False, False)  # still in the hand
+    in_hand.clear()
+    assert wait(env) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("seed", "text", "wrong"),
+    [(HOOK, PICK_PEG, "cube"), (PUSH, PUSH_CUBE, "cube"), (PUSH, PUSH_CUBE, "peg"), (GRASP, PICK_CUBE, "peg")],
+)
+def test_another_thing_in_the_hand_fails(tasks, monkeypatch, seed, text, wrong):
+    env = tasks(seed)
+    in_hand = begin(env, monkeypatch, text)
+    thing = getattr(env, wrong)
+    assert lift(env, in_hand, thing, [thing] if wrong == "cube" else [env.peg.head]) == (False, True)
+
+
+@pytest.mark.parametrize(("seed", "text"), [(HOOK, PICK_PEG), (GRASP, PICK_CUBE)])
+def test_the_cube_on_the_target_too_early_fails(tasks, monkeypatch, seed, text):
+    env = tasks(seed)
+    begin(env, monkeypatch, text)
+    put(env.cube, env.target.position, aside=0.04)
+    assert wait(env) == (False, True)
+
+
+@pytest.mark.parametrize(("seed", "text", "thing"), [(HOOK, HOOK_CUBE, "cube"), (GRASP, PLACE_CUBE, "peg")])
+def test_in_the_last_stage_nothing_fails(tasks, monkeypatch, seed, text, thing):
+    env = tasks(seed)
+    in_hand = begin(env, monkeypatch, text)
+    assert lift(env, in_hand, getattr(env, thing), [env.cube, env.peg.head]) == (False, False)
+
+
+@pytest.mark.parametrize("seed", [HOOK, PUSH])
+def test_hook_and_push_are_demonstrated(tasks, seed):
+    assert steps_of_demonstration(tasks(seed)) is not None

@@ -1,0 +1,163 @@
+"""Action spaces: what they make of an action, and what they refuse."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+sapien = pytest.importorskip("sapien", reason="the simulator is not installed: uv sync --inexact --extra sim")
+
+from mme_vla.envs.grounding import project  # noqa: E402
+from mme_vla.envs.spaces import Control, UnreachableError, action_space  # noqa: E402
+from mme_vla.envs.subtasks import Choice  # noqa: E402
+from mme_vla.errors import UserError  # noqa: E402
+
+JOINTS = [0.1, 0.2, 0.3, -1.5, 0.1, 1.5, 0.7]
+POSE = [0.1, 0.0, 0.2, np.pi, 0.0, 0.0]
+
+
+class Hand:
+    """Stands for the demonstrator: notes what it is told."""
+
+    def __init__(self, reachable: bool = True) -> None:
+        self.done: list[Any] = []
+        self.arm = SimpleNamespace(ik=lambda pose, qpos: np.arange(7.0) if reachable else None)
+
+    def move_to(self, pose: Any, gripper: float | None = None) -> None:
+        self.done.append(np.round(pose.p.astype(np.float64), 6).tolist())
+
+    def open(self) -> None:
+        self.done.append("open")
+
+    def close(self) -> None:
+        self.done.append("close")
+
+
+class Cube:
+    def __init__(self, *position: float) -> None:
+        self.position = np.array(position)
+
+
+def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list, Hand]:
+    steps: list[np.ndarray] = []
+    hand = Hand(reachable)
+    cubes = [Cube(0.0, -0.1, 0.02), Cube(0.0, 0.1, 0.02)]
+    choices = [
+        Choice("a", "pick up the cube", lambda demo, thing: demo.done.append(thing), lambda: cubes),
+        Choice("b", "press the button", lambda demo, thing: demo.done.append("pressed")),
+    ]
+    task = SimpleNamespace(stick=stick, qpos=np.zeros(7 if stick else 9), choices=lambda: choices, cubes=cubes)
+    return Control(task, steps.append, hand), steps, hand  # type: ignore[arg-type]
+
+
+def test_joint_angles_are_one_step_unchanged() -> None:
+    targets, steps, _ = control()
+    action_space("joint_angle").act(targets, [*JOINTS, -1.0])
+    assert len(steps) == 1
+    np.testing.assert_array_equal(steps[0], [*JOINTS, -1.0])
+
+
+@pytest.mark.parametrize("extra", [[], [-1.0], [-1.0, 3.0]])
+def test_the_stick_takes_the_first_seven_joint_angles(extra: list[float]) -> None:
+    targets, steps, _ = control(stick=True)
+    action_space("joint_angle").act(targets, [*JOINTS, *extra])
+    np.testing.assert_array_equal(steps, [JOINTS])
+
+
+@pytest.mark.parametrize(
+    ("name", "stick", "action", "words"),
+    [
+        ("joint_angle", False, JOINTS, r"expected 8"),
+        ("joint_angle", False, [*JOINTS, 0.0, 0.0], r"expected 8"),
+        ("joint_angle", True, JOINTS[:6], r"expected at least 7"),
+        ("joint_angle", False, [*JOINTS, np.nan], r"not finite"),
+        ("joint_angle", False, [*JOINTS, np.inf], r"not finite"),
+        ("joint_angle", False, [[*JOINTS, 1.0]], r"shape \(1, 8\)"),
+        ("joint_angle", False, "left", r"not made of numbers"),
+        ("joint_angle", False, None, r"shape|not finite|numbers"),
+        ("ee_pose", False, POSE, r"expected 7"),
+        ("ee_pose", True, POSE[:5], r"expected at least 6"),
+        ("waypoint", False, [*POSE[:5], np.nan, 1.0], r"not finite"),
+        ("multi_choice", False, "a", r"no choice"),
+        ("multi_choice", False, {"point": [1, 2]}, r"no choice"),
+        ("multi_choice", False, {"choice": "A"}, r"needs a point"),
+        ("multi_choice", False, {"choice": "A", "point": []}, r"needs a point"),
+        ("multi_choice", False, {"choice": "A", "point": [1]}, r"expected 2"),
+        ("multi_choice", False, {"choice": "A", "point": [np.nan, 2]}, r"not finite"),
+    ],
+)
+def test_malformed_actions_are_refused_without_a_step(name: str, stick: bool, action: Any, words: str) -> None:
+    targets, steps, hand = control(stick)
+    with pytest.raises(UserError, match=words):
+        action_space(name).act(targets, action)
+    assert not steps
+    assert not hand.done
+
+
+def test_a_pose_becomes_joint_angles_and_keeps_the_gripper() -> None:
+    targets, steps, _ = control()
+    action_space("ee_pose").act(targets, [*POSE, 1.0])
+    np.testing.assert_array_equal(steps, [[0, 1, 2, 3, 4, 5, 6, 1]])
+
+
+def test_a_stick_needs_no_gripper_number() -> None:
+    targets, steps, _ = control(stick=True)
+    action_space("ee_pose").act(targets, POSE)
+    np.testing.assert_array_equal(steps, [[0, 1, 2, 3, 4, 5, 6]])
+
+
+def test_an_unreachable_pose_says_so() -> None:
+    targets, steps, _ = control(reachable=False)
+    with pytest.raises(UnreachableError, match="IK failed"):
+        action_space("ee_pose").act(targets, [*POSE, 1.0])
+    assert not steps
+
+
+@pytest.mark.parametrize(("gripper", "expected"), [(-1.0, ["close"]), (1.0, ["open"]), (0.3, []), (-0.99, [])])
+def test_a_waypoint_moves_the_gripper_only_at_exactly_one(gripper: float, expected: list[str]) -> None:
+    targets, _, hand = control()
+    action_space("waypoint").act(targets, [*POSE, gripper])
+    assert hand.done == [[0.1, 0.0, 0.2], *expected]
+
+
+def test_the_stick_has_no_gripper_to_move() -> None:
+    targets, _, hand = control(stick=True)
+    action_space("waypoint").act(targets, [*POSE, -1.0])
+    assert hand.done == [[0.1, 0.0, 0.2]]
+
+
+@pytest.mark.parametrize("index", [0, 1])
+@pytest.mark.parametrize("label", ["A", "a"])
+def test_a_choice_takes_the_object_nearest_to_the_point(index: int, label: str) -> None:
+    targets, _, hand = control()
+    expected = targets.task.cubes[index]  # type: ignore[attr-defined]
+    action_space("multi_choice").act(targets, {"choice": label, "point": project(expected.position) + 3})
+    assert hand.done == [expected]
+
+
+def test_a_choice_without_an_object_needs_no_point() -> None:
+    targets, _, hand = control()
+    action_space("multi_choice").act(targets, {"choice": "B", "point": []})
+    assert hand.done == ["pressed"]
+
+
+def test_an_unknown_choice_takes_no_step_and_warns() -> None:
+    targets, steps, hand = control()
+    with pytest.warns(UserWarning, match="Unknown choice 'Z'.*Known: a, b"):
+        action_space("multi_choice").act(targets, {"choice": "Z"})
+    assert not steps
+    assert not hand.done
+
+
+def test_an_unknown_action_space_is_refused() -> None:
+    with pytest.raises(UserError, match="joint_angle"):
+        action_space("joint_angles")
+
+
+@pytest.mark.parametrize("stick", [False, True])
+@pytest.mark.parametrize("name", ["joint_angle", "ee_pose", "waypoint"])
+def test_sampled_actions_have_the_size_of_the_space(name: str, stick: bool) -> None:
+    targets, steps, hand = control(stick)
+    action_space(name).act(targets, action_space(name).space(stick).sample())
+    assert len(steps) + len(hand.done) >= 1

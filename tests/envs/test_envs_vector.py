@@ -1,0 +1,216 @@
+"""Environments in worker processes: order, frames, crashes, hangs, closing."""
+
+import gc
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from helpers.env_fakes import FRAME, make_light_env
+from mme_vla.envs import VecEnv, make_vec_env
+from mme_vla.envs.vector.pool import Job, Reply
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
+from mme_vla.errors import UserError
+
+
+@pytest.fixture(scope="module")
+def shared_envs() -> Iterator[VecEnv]:
+    """Two workers for all tests, since a process takes seconds to start."""
+    with VecEnv([], 2, make_light_env, {"video": 20}) as envs:
+        yield envs
+
+
+@pytest.fixture
+def envs(shared_envs: VecEnv) -> Iterator[VecEnv]:
+    """The same workers, both at the beginning of an episode."""
+    shared_envs.timeout = 60.0
+    for worker in range(2):
+        shared_envs.start(worker, Job("StopCube", "test", 30 + worker))
+    collect(shared_envs, 2)
+    yield shared_envs
+    shared_envs.jobs.clear()
+    while shared_envs.busy:
+        shared_envs.recv()
+
+
+def collect(envs: VecEnv, count: int) -> dict[int, Reply]:
+    """That many replies, by worker."""
+    replies: list[Reply] = []
+    while len(replies) < count:
+        replies += envs.recv()
+    assert len(replies) == count
+    return {reply.worker: reply for reply in replies}
+
+
+def only(replies: list[Reply]) -> Reply:
+    (reply,) = replies
+    return reply
+
+
+def test_every_episode_is_run_once_by_whoever_is_free(envs: VecEnv) -> None:
+    envs.jobs.extend(Job("StopCube", "test", episode) for episode in range(5))
+    begun, finished = [envs.start_next(0), envs.start_next(1)], []
+    while envs.busy:
+        for reply in envs.recv():
+            if reply.done:
+                finished.append(reply.job.episode)
+                begun.append(envs.start_next(reply.worker))
+            else:
+                envs.send(reply.worker, "end")
+    assert sorted(finished) == [0, 1, 2, 3, 4]
+    assert begun[-2:] == [None, None]
+    assert begun[0] == Job("StopCube", "test", 0)
+    assert envs.recv() == []
+
+
+def test_a_long_video_arrives_completely_and_in_order(envs: VecEnv) -> None:
+    envs.start(0, Job("StopCube", "test", 7))
+    reply = only(envs.recv())
+    frames = reply.observation["front_rgb_list"]
+    assert [int(frame[0, 0, 0]) for frame in frames] == [7 + k for k in range(21)]
+    assert all(frame.shape == FRAME and frame.dtype == np.uint8 and frame.std() == 0 for frame in frames)
+    assert reply.reward is None
+    envs.send(0, "go")
+    later = only(envs.recv())
+    assert int(later.observation["front_rgb_list"][0].max()) == 1
+    assert [int(frame[0, 0, 0]) for frame in frames] == [7 + k for k in range(21)], "earlier frames were overwritten"
+
+
+def test_whoever_is_ready_comes_first(envs: VecEnv) -> None:
+    envs.send(0, 4.0)
+    envs.send(1, 0.0)
+    assert only(envs.recv()).worker == 1
+    assert envs.recv(timeout=0.05) == []
+    assert only(envs.recv()).worker == 0
+
+
+@pytest.mark.parametrize(("action", "words"), [("die", "exit code 3"), ("hang", "gave no result within 4 s")])
+def test_a_lost_worker_is_reported_and_replaced_while_others_continue(envs: VecEnv, action: str, words: str) -> None:
+    envs.send(1, "go")
+    envs.timeout = 4.0
+    envs.send(0, action)
+    replies = collect(envs, 2)
+    assert replies[1].info["steps"] == 1
+    lost = replies[0]
+    assert lost.crashed
+    assert lost.done
+    assert lost.info["status"] == "error"
+    assert words in lost.info["error_message"]
+    assert "StopCube test episode 30" in lost.info["error_message"]
+    envs.timeout = 60.0
+    envs.start(0, Job("StopCube", "test", 6))
+    again = only(envs.recv())
+    assert not again.crashed
+    assert int(again.observation["front_rgb_list"][0][0, 0, 0]) == 6
+
+
+def test_an_exception_is_reported_and_the_worker_stays(envs: VecEnv) -> None:
+    envs.start(0, Job("StopCube", "test", 13))
+    failed = only(envs.recv())
+    assert failed.crashed
+    assert failed.info["exception_type"] == "ValueError"
+    assert "StopCube test episode 13: no scene for this seed" in failed.info["error_message"]
+    envs.start(0, Job("StopCube", "test", 2))
+    assert not only(envs.recv()).done
+    envs.send(0, "raise")
+    assert "the arm fell off" in only(envs.recv()).info["error_message"]
+
+
+def test_a_worker_whose_renderer_failed_is_replaced(envs: VecEnv) -> None:
+    before = {child.pid for child in multiprocessing.active_children()}
+    envs.send(0, "lose the renderer")
+    failed = only(envs.recv())
+    assert failed.crashed and failed.info["exception_type"] == "RuntimeError"
+    assert "StopCube test episode 30: ErrorDeviceLost" in failed.info["error_message"]
+    assert len({child.pid for child in multiprocessing.active_children()} - before) == 1
+    envs.start(0, Job("StopCube", "test", 6))
+    assert not only(envs.recv()).crashed
+    envs.send(0, "raise")
+    assert only(envs.recv()).crashed
+    envs.start(0, Job("StopCube", "test", 6))
+    assert not only(envs.recv()).crashed
+
+
+def test_misuse_is_refused(envs: VecEnv) -> None:
+    envs.jobs.append(Job("StopCube", "test", 1))
+    with pytest.raises(UserError, match="expected 0 to 1"):
+        envs.start_next(3)
+    assert len(envs.jobs) == 1
+    envs.start_next(0)
+    with pytest.raises(UserError, match="recv"):
+        envs.send(0, "go")
+
+
+def test_closing_ends_all_processes_even_busy_ones() -> None:
+    before = {child.pid for child in multiprocessing.active_children()}
+    envs = make_vec_env("StopCube", [0, 1], 2, factory=make_light_env, video=20)
+    with pytest.raises(UserError, match="runs no episode"):
+        envs.send(0, "go")
+    for worker in range(2):
+        envs.start_next(worker)
+    ready = envs.recv()[0].worker
+    envs.send(ready, "hang")
+    start = time.monotonic()
+    envs.close()
+    envs.close()
+    assert time.monotonic() - start < 20
+    assert {child.pid for child in multiprocessing.active_children()} <= before
+    for use in (envs.recv, lambda: envs.send(0, 1), lambda: envs.start_next(0)):
+        with pytest.raises(UserError, match="closed"):
+            use()
+
+
+def tell(file: Path) -> None:
+    """What a process finds when it begins."""
+    file.write_text(f"{os.environ.get('SETTING')} {gc.get_freeze_count()} {'sapien' in sys.modules}")
+
+
+def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_out_of_collections(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sapien", reason="needs the simulator: uv sync --inexact --extra sim")
+    for value in ("first", "second"):
+        monkeypatch.setenv("SETTING", value)
+        process = simulating_processes().Process(target=begin, args=(settings(), tell, tmp_path / value))
+        process.start()
+        process.join(60)
+        setting, frozen, imported = (tmp_path / value).read_text().split()
+        assert (setting, imported) == (value, "True") and int(frozen) > 100_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"tasks": "StopCub"}, "Did you mean 'StopCube'"),
+        ({"tasks": []}, "No task"),
+        ({"tasks": "StopCube", "episodes": [50]}, "expected 0 to 49"),
+        ({"tasks": "StopCube", "workers": 0}, "positive integer"),
+        ({"tasks": "StopCube", "timeout": 0}, "positive number"),
+        ({"tasks": "StopCube", "action_space": "joints"}, "joint_angle"),
+    ],
+)
+def test_unknown_names_are_refused_before_any_process_starts(
+    monkeypatch: pytest.MonkeyPatch, arguments: dict[str, Any], words: str
+) -> None:
+    monkeypatch.setattr("mme_vla.envs.vector.pool.require_simulator", lambda: None)
+    with pytest.raises(UserError, match=words):
+        make_vec_env(**arguments)
+
+
+def test_real_environments_run_in_workers() -> None:
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
+    with make_vec_env("VideoUnmask", [4], workers=1, split="train", render=False) as envs:
+        envs.start_next(0)
+        reply = only(envs.recv())
+        assert len(reply.observation["joint_state_list"]) == 67
+        assert reply.info["task_goal"] == ["watch the video carefully, then pick up the container hiding the blue cube"]
+        envs.send(0, np.append(reply.observation["joint_state_list"][-1], 1.0))
+        reply = only(envs.recv())
+        assert reply.info["status"] == "ongoing"
+        assert float(reply.reward) == 0.0

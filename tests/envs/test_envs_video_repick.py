@@ -1,0 +1,167 @@
+"""VideoRepick: layout, the swaps after the first pick, which picks count, and when the button may be pressed."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
+
+from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube
+from helpers.env_unmask import make, push_down, texts, wait
+from mme_vla.envs.scene.placement import Draws, Region, rotated_anchors
+from mme_vla.envs.scene.things import distance_xy
+from mme_vla.envs.tasks.video_repick import VideoRepick
+
+SWAPS = {"easy": (1, 2), "medium": (2, 3)}
+ONCE, TWICE = 2, 1  # seeds: one repetition and three swaps, two repetitions
+FIRST, SECOND = (f"pick up the correct cube for the {i} time" for i in ("first", "second"))
+SHOWN = ["pick up the cube", "drop the cube on the table"]
+PUT, PRESS = "put it down", "press the button to finish"
+
+
+def at(env: VideoRepick, text: str) -> None:
+    """Go to the first sub-task of the execution that has this text."""
+    env.progress.index = next(i for i, s in enumerate(env.progress.subtasks) if s.text == text and not s.video)
+
+
+def pressed_after(env: VideoRepick, steps: int) -> bool:
+    """Let time go by, hold the button down for one evaluation; whether that was a failure."""
+    env._elapsed_steps += steps
+    env.button.articulation.set_qpos(np.full((1, 1), -0.1, np.float32))
+    failed = bool(env.evaluate()["fail"])
+    env.button.restore()
+    return failed
+
+
+@pytest.fixture(scope="module")
+def twice() -> Iterator[VideoRepick]:
+    env = make(VideoRepick, TWICE, "hard")
+    yield env
+    env.close()
+
+
+@pytest.fixture
+def hand(twice: VideoRepick, monkeypatch: pytest.MonkeyPatch) -> Hand:
+    twice.reset()
+    return Hand(twice, monkeypatch)
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_everything_comes_from_one_stream_in_order(seed, difficulty):
+    env, stream = make(VideoRepick, seed, difficulty, recovery="z"), Draws(seed)
+    assert env.repetitions == stream.integer(1, 4) and env.repetitions in (1, 2, 3)
+    low, high = SWAPS.get(difficulty, (0, 0))
+    assert low <= env.swap_count <= high and env.swap_count == stream.integer(low, high + 1)
+    read_button(stream, env.button, (-0.2, 0), (0.1, 0.1))
+    if difficulty == "hard":
+        assert len(env.cubes) == 15 and env.initiators == []
+        for i in range(0, 15, 3):
+            for cube, j in zip(env.cubes[i : i + 3], stream.permutation(3), strict=True):
+                assert cube.colour == COLOURS[j]
+                read_cube(stream, Region((-0.1, 0), (0.2, 0.25)), cube)
+        assert env.cube is env.cubes[stream.integer(0, 15)]
+    else:
+        assert {cube.colour for cube in env.cubes} == {COLOURS[stream.integer(0, 3)]}
+        stream.permutation(4)
+        for anchor, cube in zip(rotated_anchors(stream, 3), env.cubes, strict=True):
+            read_cube(stream, Region(anchor, 0.07), cube)
+        assert env.cube is env.cubes[stream.permutation(3)[0]]
+        others = [cube for cube in env.cubes if cube is not env.cube]
+        assert env.initiators == [env.cube, *(others[i] for i in stream.permutation(2))][: env.swap_count]
+    assert env.failed_pick == [stream.integer(0, env.repetitions) for _ in range(2)][1]
+    assert least_distance(env.cubes) >= 0.04  # a cube counts as a line only where its box happens to stand on end
+    assert min(distance_xy(cube.position, env.button.position) for cube in env.cubes) > 0.05625 + 0.04
+    env.close()
+
+
+def test_texts_and_goals_of_two_repetitions_without_swaps(twice):
+    assert [step.text for step in twice.progress.subtasks if step.video] == [*SHOWN, "NO RECORD"]
+    assert texts(twice)[3:] == [
+        (FIRST, "pick up the correct cube at <> for the first time", "a"),
+        (PUT, PUT, "b"),
+        (SECOND, "pick up the correct cube at <> for the second time", "a"),
+        (PUT, PUT, "b"),
+        (PRESS, "press the button at <> to finish", "c"),
+    ]
+    again = "repeatedly pick up and put down the same block that was previously picked up for two times"
+    ends = ("finally put it down and press the button to stop", "finally press the button to stop")
+    assert twice.goals() == [f"watch the video carefully, then {again}, {end}" for end in ends]
+    assert [option.needs_point for option in twice.choices()] == [True, False, False]
+
+
+def test_the_video_ends_with_the_swaps_one_after_another():
+    env = make(VideoRepick, ONCE, "medium")
+    assert env.repetitions == 1 and env.swap_count == 3
+    video = [*SHOWN, *["static"] * 4, "NO RECORD"]
+    assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]
+    assert env.goals() == [
+        "watch the video carefully, then pick up the same block that was previously picked up again, "
+        "finally put it down and press the button to stop"
+    ]
+    env.progress.index = 3
+    wait(env)  # the swaps begin in the step after the one in which the stage was seen
+    for initiator in env.initiators:
+        start = {cube: cube.position for cube in env.cubes}
+        remaining = [cube for cube in env.cubes if cube is not initiator]
+        partner, third = sorted(remaining, key=lambda cube: distance_xy(start[cube], start[initiator]))
+        wait(env, 26)
+        middle = (start[initiator] + start[partner]) / 2
+        assert distance_xy(initiator.position, middle) == pytest.approx(0.07, abs=5e-3)
+        wait(env, 24)
+        for cube, place in ((initiator, partner), (partner, initiator), (third, third)):
+            assert distance_xy(cube.position, start[place]) < 6e-3
+    assert env.progress.index == 5  # the third of three stages of 50 steps
+    assert wait(env, 5) == (False, False) and env.progress.index == 6
+    env.close()
+
+
+def test_as_many_picks_as_requested_and_the_button_are_success(twice, hand):
+    at(twice, FIRST)
+    for _ in range(2):
+        assert hand.carry(twice.cube) == (False, False)
+        assert hand.release() == (False, False)
+    assert twice.progress.current.text == PRESS
+    assert push_down(twice, twice.button) == (True, False)
+    twice.button.restore()
+    assert wait(twice) == (True, False)
+
+
+@pytest.mark.parametrize("stage", [FIRST, PUT, SECOND])
+def test_another_cube_picked_up_is_a_lasting_failure(twice, hand, stage):
+    at(twice, stage)
+    other = next(c for c in twice.cubes if c is not twice.cube and c.colour == twice.cube.colour)
+    assert hand.carry(other) == (False, True)
+    assert hand.release() == (False, True)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_any_cube_picked_up_instead_of_pressing_fails(twice, hand, right):
+    at(twice, PRESS)
+    assert hand.carry(twice.cube if right else twice.cubes[twice.cubes.index(twice.cube) - 1]) == (False, True)
+    assert push_down(twice, twice.button) == (False, True)
+
+
+@pytest.mark.parametrize("stage", [FIRST, PUT])
+@pytest.mark.parametrize(("steps", "fails"), [(0, False), (49, False), (50, True), (500, True), (501, False)])
+def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_entered(twice, hand, stage, steps, fails):
+    at(twice, stage)
+    if stage == PUT:
+        hand.carry(twice.cube)  # which enters the stage, too
+    twice.evaluate()
+    assert pressed_after(twice, steps) == fails
+    assert wait(twice) == (False, fails)
+
+
+def test_picks_and_puts_have_a_timer_each_which_the_second_round_does_not_restart(twice, hand):
+    at(twice, FIRST)
+    twice.evaluate()
+    twice._elapsed_steps += 100
+    hand.carry(twice.cube)  # the pick is done
+    assert not pressed_after(twice, 0)  # the wait of the put begins here
+    hand.release()
+    assert twice.progress.current.text == SECOND
+    assert not pressed_after(twice, 460)  # 560 steps after the first pick began
+    assert hand.carry(twice.cube) == (False, False)
+    assert pressed_after(twice, 0)  # some 460 steps after the first put began

@@ -1,0 +1,201 @@
+"""Episodes that processes share: each taken once, the longest first, and again after a process was killed."""
+
+import errno
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
+from mme_vla.evaluation import store
+from mme_vla.evaluation.records import EpisodeRecord, Seconds
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.compare import compare
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.progress import Durations, earlier_records
+from mme_vla.evaluation.rollout.runner import Waiting
+from mme_vla.evaluation.store import Claims, RecordLog
+from mme_vla.utils import write_json
+
+JOBS = [Job("BinFill", "test", i) for i in range(4)]
+
+TAKE_TWO = """
+import os, signal, sys
+from pathlib import Path
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.store import Claims
+from mme_vla.evaluation.store import RecordLog
+from mme_vla.evaluation.records import EpisodeRecord
+folder = Path(sys.argv[1])
+log = RecordLog(folder / "episodes-0of2.jsonl")
+claims, jobs = Claims(folder, "episodes-0of2.jsonl"), [Job("BinFill", "test", i) for i in range(4)]
+first = claims.take(jobs)
+log.append(EpisodeRecord("tiny", 1, 7, first.task, first.episode, 1, "easy", "success", 5))
+claims.take(jobs[1:])
+print("taken", flush=True)
+sys.stdin.read()
+"""
+
+
+def record(episode: int, seconds: float = 1.0, outcome: str = "success", task: str = "BinFill") -> EpisodeRecord:
+    times = Seconds(sim=0.75 * seconds, policy=0.25 * seconds, total=2 * seconds)
+    return EpisodeRecord("tiny", 1, 7, task, episode, 1, "easy", outcome, 5, times)
+
+
+def taken(job: Job | None) -> int | None:
+    return None if job is None else job.episode
+
+
+def test_each_episode_is_taken_once(tmp_path: Path) -> None:
+    names = [f"episodes-{i}of2.jsonl" for i in range(2)]
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        first, second = (Claims(tmp_path, name) for name in names)
+        assert [taken(claims.take(JOBS)) for claims in (first, second, second, first)] == [0, 1, 2, 3]
+        assert first.take(JOBS) is None and second.take(JOBS) is None
+
+
+@pytest.mark.slow
+def test_unfinished_episodes_of_a_killed_process_are_taken_again(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", TAKE_TWO, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "taken\n"
+    other = "episodes-1of2.jsonl"
+    with RecordLog(tmp_path / other):
+        claims = Claims(tmp_path, other)
+        assert taken(claims.take(JOBS)) == 2  # the process is alive and holds 0 and 1
+        process.kill()
+        process.communicate()
+        assert [taken(claims.take(JOBS)) for _ in range(3)] == [1, 3, None]  # it had finished 0
+        with RecordLog(tmp_path / "episodes-0of2.jsonl"):  # restarted under its old name
+            again = Claims(tmp_path, "episodes-0of2.jsonl")
+            assert again.take(JOBS) is None
+
+
+def test_a_restarted_process_gives_back_its_unfinished_episodes(tmp_path: Path) -> None:
+    names = [f"episodes-{i}of2.jsonl" for i in range(2)]
+    with RecordLog(tmp_path / names[0]) as log:
+        before = Claims(tmp_path, names[0])
+        assert [taken(before.take(JOBS)) for _ in range(2)] == [0, 1]
+        log.append(record(0))
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        Claims(tmp_path, names[0])
+        other = Claims(tmp_path, names[1])
+        assert [taken(other.take(JOBS)) for _ in range(2)] == [1, 2]
+
+
+def test_one_of_two_processes_takes_over_a_stale_claim(tmp_path: Path) -> None:
+    with RecordLog(tmp_path / "episodes-0of3.jsonl"):
+        Claims(tmp_path, "episodes-0of3.jsonl").take(JOBS[:1])
+    names = [f"episodes-{i}of3.jsonl" for i in (1, 2)]
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        first, second = (Claims(tmp_path, name) for name in names)  # both have read the stale claim
+        assert [taken(claims.take(JOBS[:1])) for claims in (first, second)] == [0, None]
+
+
+@pytest.mark.parametrize(("process", "holds"), [(1, True), (2**22 + 1, False)])
+def test_without_locks_the_process_number_decides(
+    process: int, holds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(store.fcntl, "flock", no_locks)
+    (tmp_path / "episodes-0of2.jsonl").touch()
+    write_json(tmp_path / "claims" / "BinFill-0.0.json", vars(store.Claim("episodes-0of2.jsonl", process=process)))
+    assert (Claims(tmp_path, "episodes-1of2.jsonl").take(JOBS[:1]) is None) == holds
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "{", "[]", "{}", '{"records": 7, "host": "a", "process": 1}', "\x00",
+        '{"records": "../episodes.jsonl", "host": "a", "process": 1}',
+        '{"records": "/etc/passwd", "host": "a", "process": 1}',
+        '{"records": null, "host": "a", "process": 0}', '{"records": null, "host": "a", "process": true}',
+        '{"records": null, "host": "a", "process": 1, "more": 1}',
+    ],
+)  # fmt: skip
+def test_a_damaged_claim_is_named(content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "_await_content", lambda path: None)
+    joined = Claims(tmp_path, "episodes-0of2.jsonl")
+    path = tmp_path / "claims" / "BinFill-0.0.json"
+    path.parent.mkdir()
+    path.write_text(content)
+    for read in (lambda: Claims(tmp_path, "episodes-1of2.jsonl"), lambda: joined.take(JOBS)):
+        with pytest.raises(UserError, match=r"claims/BinFill-0\.0\.json is damaged.*Remove the folder"):
+            read()
+
+
+def test_a_folder_in_place_of_a_claim_is_named(tmp_path: Path) -> None:
+    (tmp_path / "claims" / "BinFill-0.0.json").mkdir(parents=True)
+    with pytest.raises(UserError, match=r"BinFill-0\.0\.json is damaged"):
+        Claims(tmp_path, "episodes-0of2.jsonl")
+
+
+def test_claims_of_earlier_versions_are_ignored(tmp_path: Path) -> None:
+    (tmp_path / "claims.jsonl").write_text("anything")
+    with RecordLog(tmp_path / "episodes-0of2.jsonl"):
+        assert taken(Claims(tmp_path, "episodes-0of2.jsonl").take(JOBS)) == 0
+
+
+def test_episodes_that_took_longest_begin_first() -> None:
+    durations = Durations([record(0, 1), record(1, 4), record(0, 8, task="PickXtimes")])
+    jobs = [*JOBS[:3], Job("PickXtimes", "test", 5), Job("StopCube", "test", 0)]
+    order = durations.longest_first(jobs)
+    assert [(job.task, job.episode) for job in order] == [
+        ("PickXtimes", 5), ("StopCube", 0), ("BinFill", 1), ("BinFill", 2), ("BinFill", 0),
+    ]  # fmt: skip
+    assert Durations([]).longest_first(jobs) == jobs
+
+
+def test_the_forecast_follows_whoever_is_slower() -> None:
+    durations = Durations([record(0, 3600)])
+    alone = durations.forecast(JOBS, workers=1)
+    assert alone is not None and alone.seconds == pytest.approx(4 * 0.75 * 3600)
+    many = durations.forecast(JOBS, workers=4)
+    assert many is not None and many.seconds == pytest.approx(3600)  # the policy's quarter of each, one by one
+    shared = durations.forecast(JOBS * 10, workers=4, processes=2)
+    assert shared is not None and shared.seconds == pytest.approx(5 * 3600)
+    assert str(shared) == (
+        "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1 before them did"
+    )
+    assert Durations([]).forecast(JOBS, workers=1) is None
+
+
+def test_earlier_records_are_those_beside_the_run_or_those_named(tmp_path: Path) -> None:
+    with RecordLog(tmp_path / "runs" / "seed7" / "episodes.jsonl") as log:
+        log.append(record(0))
+        log.append(record(1, outcome="error"))
+    assert len(earlier_records(tmp_path / "runs" / "seed42", None)) == 1
+    assert earlier_records(tmp_path / "seed42", None) == []
+    assert len(earlier_records(tmp_path, tmp_path / "runs")) == 1
+    with pytest.raises(UserError):
+        earlier_records(tmp_path, tmp_path / "nothing")
+
+
+def test_an_episode_that_is_tried_again_comes_last() -> None:
+    waiting = Waiting(JOBS[:2])
+    first = waiting.take()
+    assert first is not None
+    waiting.put_back(first)
+    assert [taken(waiting.take()) for _ in range(3)] == [1, 0, None]
+
+
+def test_episodes_that_end_otherwise_between_equal_runs_are_counted() -> None:
+    protocol = Protocol(("BinFill",), 4)
+    once = [record(i) for i in range(4)]
+    twice = [*once, record(0), record(1, outcome="fail"), record(2, outcome="error")]
+    other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(4)]
+    results = aggregate([*twice, *other], protocol, conflicts="first")
+    method = results.method("tiny")
+    assert (method.repeated, method.flipped) == (2, 1)
+    assert any("2 episodes were run more than once" in note for note in results.notes)
+    comparison = compare(method, results.method("else"), protocol)
+    assert (comparison.repeated, comparison.flipped) == (2, 1)
+    assert comparison.verdict.endswith("of 2 episodes run twice alike, 1 ended otherwise")
+    alone = aggregate([*once, *other], protocol)
+    assert "run twice" not in compare(alone.method("tiny"), alone.method("else"), protocol).verdict

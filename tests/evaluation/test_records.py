@@ -1,0 +1,198 @@
+"""Episode records: on disk at once, safe against a kill, merged by clear rules, bound to their run's settings."""
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mme_vla import UserError
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, Seconds, by_run, finished, merge
+from mme_vla.evaluation.store import RecordLog, claim_run, find_records, fingerprint, read_records, read_run
+
+
+def record(**changes: Any) -> EpisodeRecord:
+    values = {"model": "pi05", "checkpoint": 100, "model_seed": 7, "task": "BinFill", "episode": 0, "seed": 540_000,
+              "difficulty": "easy", "outcome": "success", "steps": 321, "seconds": Seconds(1.5, 0.5, 2.25)}  # fmt: skip
+    return EpisodeRecord(**{**values, **changes})
+
+
+def test_a_record_survives_its_line() -> None:
+    made = record(error="IK failed\nat step 3", outcome="error", subgoal="qwenvl", extra={"video": "a/b.mp4"})
+    line = made.to_json()
+    assert "\n" not in line
+    assert EpisodeRecord.from_json(line) == made
+
+
+def test_a_checkpoint_step_is_one_checkpoint_as_text_or_number() -> None:
+    assert record(checkpoint="60000").run == record(checkpoint=60000).run
+    assert record(checkpoint="best").checkpoint == "best"
+
+
+def test_wrong_values_are_named() -> None:
+    with pytest.raises(UserError, match=r"outcome 'sucess'.*'success'"):
+        record(outcome="sucess")
+    with pytest.raises(UserError, match=r"episode='3'.*int, not str"):
+        record(episode="3")
+    with pytest.raises(UserError, match="unknown field 'sucess'"):
+        EpisodeRecord.from_json('{"sucess": true}')
+    with pytest.raises(UserError, match="missing"):
+        EpisodeRecord.from_json('{"model": "pi05"}')
+
+
+def test_every_record_is_on_disk_when_append_returns(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "episodes.jsonl"
+    with RecordLog(path) as log:
+        for episode in range(3):
+            log.append(record(episode=episode))
+            assert read_records(path)[-1].episode == episode
+
+
+def test_a_half_saved_last_line_is_ignored_and_then_repaired(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.jsonl"
+    with RecordLog(path) as log:
+        log.append(record(episode=0))
+    line = record(episode=1).to_json()
+    for cut in (1, len(line) // 2, len(line) - 1):
+        with path.open("a") as file:
+            file.write(line[:cut])
+        with pytest.warns(UserWarning, match="half-written"):
+            assert [r.episode for r in read_records(path)] == [0]
+        with pytest.warns(UserWarning, match="removed"), RecordLog(path) as log:
+            log.append(record(episode=2))
+        assert [r.episode for r in read_records(path)] == [0, 2]
+        path.write_text(record(episode=0).to_json() + "\n")
+
+
+def test_a_last_line_that_lacks_only_its_end_is_valid(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(record(episode=0).to_json())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with RecordLog(path) as log:
+            log.append(record(episode=1))
+        assert [r.episode for r in read_records(path)] == [0, 1]
+
+
+def test_damage_in_other_lines_is_an_error_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(f"{record().to_json()}\n{{broken\n{record(episode=1).to_json()}\n")
+    with pytest.raises(UserError, match="line 2"):
+        read_records(path)
+
+
+def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "episodes.jsonl"
+    with RecordLog(path), pytest.raises(UserError, match="file of its own"):
+        RecordLog(path)
+    RecordLog(path).close()
+
+
+def test_shards_of_a_folder_are_detected_once(tmp_path: Path) -> None:
+    for name in ("a/episodes-0.jsonl", "a/episodes-1.jsonl", "b/episodes.jsonl", "b/other.jsonl"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    files = find_records([tmp_path, tmp_path / "b" / "episodes.jsonl"])
+    assert [str(f.relative_to(tmp_path)) for f in files] == [
+        "a/episodes-0.jsonl",
+        "a/episodes-1.jsonl",
+        "b/episodes.jsonl",
+    ]
+    with pytest.raises(UserError, match="does not exist"):
+        find_records([tmp_path / "c"])
+    (tmp_path / "c").mkdir()
+    with pytest.raises(UserError, match="holds no results"):
+        find_records([tmp_path / "c"])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_result_supersedes_an_error_in_whatever_order(turned: bool) -> None:
+    both = [record(outcome="error", error="IK"), record(outcome="fail")]
+    assert [r.outcome for r in merge(both[::-1] if turned else both)] == ["fail"]
+
+
+def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
+    early, late = record(when="2026-01-01T00:00:00+00:00"), record(outcome="fail", when="2026-01-02T00:00:00+00:00")
+    with pytest.raises(UserError, match="evaluated twice"):
+        merge([early, late])
+    for order in ([early, late], [late, early]):
+        assert merge(order, "first") == [early]
+        assert merge(order, "last") == [late]
+    assert merge([early, replace(early, when=late.when)]) == [early]
+    with pytest.raises(UserError, match="Did you mean 'last'"):
+        merge([early], "lst")
+
+
+def test_other_runs_and_subgoals_and_budgets_do_not_conflict() -> None:
+    changes = {"model_seed": 0, "checkpoint": 1, "subgoal": "oracle", "memory_budget": 64, "split": "val"}
+    different = [record(), *(record(outcome="fail", **{name: value}) for name, value in changes.items())]
+    assert merge(different) == different
+    assert len(by_run(different)) == len(different)
+
+
+def test_one_episode_in_two_environments_is_refused() -> None:
+    with pytest.raises(UserError, match="seeds 540000 and 1"):
+        merge([record(), record(seed=1)])
+
+
+def test_a_run_of_two_step_limits_is_refused() -> None:
+    with pytest.raises(UserError, match="mixes max_steps 300 and 1300"):
+        by_run([record(), record(episode=1, max_steps=300)])
+
+
+def test_errors_are_retried_by_default() -> None:
+    records = [record(), record(episode=1, outcome="error"), record(episode=2, outcome="timeout")]
+    assert finished(records) == {EpisodeKey("BinFill", 0), EpisodeKey("BinFill", 2)}
+    assert finished(records, retry_errors=False) == {EpisodeKey("BinFill", e) for e in range(3)}
+
+
+def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
+    settings = {"checkpoint": 100, "seeds": (7, 42), "env": {"split": "test", "max_steps": 1300}}
+    first = claim_run(tmp_path, settings, notes={"device": "cpu"})
+    assert claim_run(tmp_path, settings, notes={"device": "cuda"}) == first == read_run(tmp_path)
+    other = {**settings, "env": {"split": "test", "max_steps": 300}, "extra": 1}
+    with pytest.raises(UserError, match=r"env.max_steps was 1300, is 300; extra was 'not set', is 1"):
+        claim_run(tmp_path, other)
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
+
+
+def test_a_fingerprint_does_not_depend_on_the_order_of_keys() -> None:
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1}) != fingerprint({"a": 1, "b": 3})
+
+
+def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:
+    claim_run(tmp_path, {"a": 1})
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "settings": {"a": 2}}))
+    with pytest.raises(UserError, match="changed manually"):
+        read_run(tmp_path)
+    path.write_text("{")
+    with pytest.raises(UserError, match="not valid JSON"):
+        read_run(tmp_path)
+
+
+def test_a_run_begins_and_resumes_where_there_are_no_hard_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_links(*_: object) -> None:
+        raise PermissionError("Operation not permitted")
+
+    monkeypatch.setattr("os.link", no_links)
+    first = claim_run(tmp_path, {"a": 1})
+    assert claim_run(tmp_path, {"a": 1}) == first == read_run(tmp_path)
+    with pytest.raises(UserError, match="a was 1, is 2"):
+        claim_run(tmp_path, {"a": 2})
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
+
+
+def test_processes_of_one_number_on_two_machines_do_not_share_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    linked = []
+    monkeypatch.setattr("os.getpid", lambda: 1)
+    monkeypatch.setattr("os.link", lambda source, _: linked.append(source))
+    for _ in range(2):
+        claim_run(tmp_path, {"a": 1})
+    assert len(set(linked)) == 2

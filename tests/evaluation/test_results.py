@@ -1,0 +1,495 @@
+"""The results command: the paper's tables come back, nothing incomplete is averaged, comparisons are paired."""
+
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mme_vla import UserError
+from mme_vla.cli import results as results_command
+from mme_vla.cli.results import main
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.aggregate import (
+    Results,
+    aggregate,
+    bootstrap,
+    effective_trials,
+    holm,
+    mean_std,
+    sign_test,
+    wilson,
+)
+from mme_vla.evaluation.results.compare import compare, compare_all
+from mme_vla.evaluation.results.paper import chunk_flops, demo_records
+from mme_vla.evaluation.results.report import policy_facts, training_details
+from mme_vla.evaluation.results.scopes import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES, Protocol, tasks_of
+from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
+from mme_vla.evaluation.store import RecordLog, claim_run
+from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS
+
+# Where the paper's suite and group tables differ from the means of its own per-task table.
+MISPRINTS = {("pi_0.5", "Short-Horizon Video Reasoning"), ("RMT+Expert", "Reference"), ("RMT+Expert", "average"),
+             ("TTT+Modul", "Permanence"), ("TTT+Modul", "average"), ("TokenDrop+Context", "Imitation")}  # fmt: skip
+SMALL = Protocol(("BinFill", "MoveCube"), episodes=4, samples=200)
+
+
+def records(
+    model: str, wins: dict[str, list[int]], seed: int = 7, checkpoint: int = 100, **more: object
+) -> list[EpisodeRecord]:
+    """One run: for each task the outcomes of its episodes."""
+    return [
+        EpisodeRecord(model, checkpoint, seed, task, e, e, "easy", "success" if won else "fail", 10, **more)  # type: ignore[arg-type]
+        for task, outcomes in wins.items()
+        for e, won in enumerate(outcomes)
+    ]
+
+
+def as_published(method: str) -> list[EpisodeRecord]:
+    """Nine runs with as many successes in all as the paper's rates mean."""
+    known = paper.paper_methods()[method]
+    made = []
+    for task, result in paper.per_task(method).items():
+        outcomes = np.arange(450) < round(4.5 * result.mean)
+        for i, run in enumerate(np.random.default_rng(0).permutation(outcomes).reshape(9, 50)):
+            made += records(known.model or "", {task: run.tolist()}, seed=(7, 42, 0)[i % 3], checkpoint=i // 3)
+    return made
+
+
+@pytest.fixture(scope="module")
+def demo() -> Results:
+    return aggregate(demo_records([("framesamp_modul", None), ("groundsg", "qwenvl")]), Protocol(samples=200))
+
+
+@pytest.fixture(scope="module")
+def made_up() -> list[EpisodeRecord]:
+    """One run of each method: that these are synthetic, and which there are, does not depend on how many."""
+    return demo_records(results_command.DEMO, checkpoints=(60_000,), seeds=(7,))
+
+
+@pytest.fixture
+def sampled_once(monkeypatch: pytest.MonkeyPatch, made_up: list[EpisodeRecord]) -> None:
+    """The command's synthetic records are drawn for all tests at once."""
+    monkeypatch.setattr(results_command, "demo_records", lambda methods: list(made_up))
+
+
+# The paper
+
+
+@pytest.mark.parametrize(("method", "average"), [("FrameSamp+Modul", 44.51), ("pi_0.5", 17.93)])
+def test_records_with_the_papers_rates_give_the_papers_average_suites_and_groups(method: str, average: float) -> None:
+    (method_result,) = aggregate(as_published(method), Protocol(samples=100)).methods
+    assert method_result.average.mean == pytest.approx(average, abs=0.006)
+    assert method_result.average.complete == 9
+    for kind, table in (("suite", "suites"), ("group", "groups")):
+        printed = next(row for row in paper.paper_table(table) if row["method"] == method)
+        for name, figure in method_result.figures[kind].items():
+            if (method, name) not in MISPRINTS:
+                assert figure.mean == pytest.approx(float(printed[name]), abs=0.0101), name
+
+
+def test_the_papers_tasks_give_its_averages_suites_and_groups() -> None:
+    differing = set()
+    for row in paper.paper_table("suites"):
+        suite_means = {suite: paper.suite_mean(row["method"], suite).mean for suite in SUITES}
+        suite_means["average"] = paper.average(row["method"]).mean
+        differing |= {
+            (row["method"], name) for name, mean in suite_means.items() if abs(mean - float(row[name])) > 0.0101
+        }
+    for row in paper.paper_table("groups"):
+        means = {group: paper.group_mean(row["method"], group).mean for group in GROUPS}
+        differing |= {(row["method"], name) for name, mean in means.items() if abs(mean - float(row[name])) > 0.0101}
+    assert differing == MISPRINTS
+
+
+def test_the_shipped_numbers_are_the_papers(shared: Path) -> None:
+    for name, published in {"per_task": "results_per_task", "memory_budget": "memory_budget"}.items():
+        assert paper.paper_table(name) == list(csv.DictReader((shared / "paper" / f"{published}.csv").open()))
+    for row in csv.DictReader((shared / "paper" / "task_groups.csv").open()):
+        task = TASK_FACTS[row["task"]]
+        facts = (task.suite, "+".join(task.memory), task.group, str(task.steps))
+        assert facts == (row["suite"], row["memory_type"], row["functional_group"], row["avg_steps"])
+
+
+def test_every_task_stands_in_both_orders_and_every_model_has_its_paper_numbers() -> None:
+    assert sorted(TASK_NAMES) == sorted(PAPER_ORDER)
+    assert len(TASK_NAMES) == 16
+    models = {method.model for method in paper.paper_methods().values()} - {None}
+    assert models | set(ALL_MODELS) | set(ALL_BEYOND) <= set(chunk_flops())
+
+
+# Statistics
+
+
+def test_wilson_is_the_textbooks() -> None:
+    assert wilson(0.0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert wilson(0.5, 50) == pytest.approx((0.3664, 0.6336), abs=1e-4)
+
+
+def test_repeats_of_the_same_episodes_are_worth_less_than_new_ones() -> None:
+    rng = np.random.default_rng(0)
+    one = (rng.random((50, 1)) < 0.4).astype(float)
+    assert effective_trials(np.repeat(one, 9, axis=1)) == 50  # nine runs that agree always
+    independent = (rng.random((50, 9)) < 0.4).astype(float)
+    assert 300 < effective_trials(independent) <= 450
+    assert effective_trials(np.ones((50, 9))) == 50  # no difference seen: nothing known of agreement
+
+
+def test_the_bootstrap_covers_the_truth_as_frequently_as_it_says() -> None:
+    rng, covered = np.random.default_rng(1), 0
+    for trial in range(200):
+        interval = bootstrap(
+            {t: (rng.random(50) < p).astype(float) for t, p in (("a", 0.2), ("b", 0.7))}, samples=300, seed=trial
+        )
+        covered += interval.low <= 0.45 <= interval.high
+    assert 0.89 <= covered / 200 <= 0.99
+
+
+def test_sign_test_and_holm_are_the_textbooks() -> None:
+    assert sign_test(0, 0) == 1.0
+    assert sign_test(1, 9) == pytest.approx(22 / 1024)
+    assert sign_test(5, 5) == 1.0
+    assert sign_test(4000, 1000) < 1e-300
+    assert holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+
+
+def test_one_run_has_no_deviation() -> None:
+    assert mean_std([0.5]) == (0.5, None)
+    assert mean_std([0.4, 0.6]) == (0.5, pytest.approx(math.sqrt(0.02)))
+
+
+# Aggregation
+
+
+def test_runs_are_averaged_after_their_tasks() -> None:
+    made = records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [0, 0, 0, 1]}, seed=0)
+    made += records("a", {"BinFill": [1, 1, 0, 0], "MoveCube": [0, 0, 0, 0]}, seed=1)
+    (method,) = aggregate(made, SMALL).methods
+    rates = (62.5, 25.0)
+    assert method.average.mean == pytest.approx(np.mean(rates))
+    assert method.average.std == pytest.approx(np.std(rates, ddof=1))
+    assert method.figures["suite"]["Imitation"].mean == pytest.approx(12.5)
+    assert method.figures["task"]["BinFill"].mean == pytest.approx(75)
+    assert set(method.figures["group"]) == {"Event-Salient"}
+
+
+def test_an_incomplete_run_is_reported_as_incomplete_and_never_averaged() -> None:
+    complete = records("a", {"BinFill": [1, 1, 0, 0], "MoveCube": [1, 0, 0, 0]}, seed=0)
+    part = records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1]}, seed=1)
+    results = aggregate(complete + part, SMALL)
+    average = results.methods[0].average
+    assert (average.mean, average.std, average.complete, average.runs) == (37.5, None, 1, 2)
+    assert "(1 of 2 runs)" in overview(results).rows[0][-3]
+    assert any("6 of 8 episodes" in note for note in results.notes)
+    assert results.methods[0].figures["task"]["BinFill"].complete == 2  # that task is whole in both
+    alone = aggregate(part, SMALL)
+    assert alone.methods[0].average.mean is None
+    assert overview(alone).rows[0][-3] == "incomplete (6 of 8)"
+    (board,) = leaderboard(alone.methods[0], alone)
+    assert board.rows[1][1:] == ["2 of 4 episodes", "incomplete"]
+    assert board.rows[-1][1:] == ["incomplete", "incomplete"]
+
+
+def test_errors_are_failures_or_missing_as_requested() -> None:
+    made = records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]})
+    made[0] = replace(made[0], outcome="error")
+    results = aggregate(made, SMALL)
+    assert results.methods[0].average.mean == 87.5
+    assert any("1 episodes ended in an error" in note for note in results.notes)
+    assert aggregate(made, replace(SMALL, errors="missing")).methods[0].average.mean is None
+
+
+def test_difficulties_cut_across_tasks() -> None:
+    made = records("a", {"BinFill": [1, 1, 0, 0], "MoveCube": [1, 0, 0, 0]})
+    made = [replace(r, difficulty="hard" if r.episode > 1 else "easy") for r in made]
+    figures = aggregate(made, SMALL).methods[0].figures["difficulty"]
+    assert {level: figure.mean for level, figure in figures.items()} == {"easy": 75.0, "hard": 0.0}
+    # Of MoveCube only easy episodes are done: what its hard ones will be is not known.
+    figures = aggregate(made[:6], SMALL).methods[0].figures["difficulty"]
+    assert {figure.mean for figure in figures.values()} == {None}
+
+
+def test_wrong_records_are_refused() -> None:
+    made = records("a", {"BinFill": [1]})
+    for wrong, message in (
+        ([replace(made[0], task="BinFil")], "None of the 1 records"),
+        ([*made, replace(made[0], split="val")], "several splits"),
+        ([*made, replace(made[0], model="b", seed=9)], "different benchmarks"),
+        ([replace(made[0], episode=90)], "None of the 1 records"),
+        ([], "no record"),
+    ):
+        with pytest.raises(UserError, match=message):
+            aggregate(wrong, SMALL)
+    with pytest.raises(UserError, match="each once"):
+        Protocol(("BinFill", "BinFill"))
+    with pytest.raises(
+        UserError, match=r"RoboMME has no task 'BinFil', and no record is of it\. Did you mean 'BinFill'"
+    ):
+        aggregate(made, Protocol(("BinFill", "BinFil")))
+
+
+def test_own_tasks_form_a_group_beside_the_benchmark() -> None:
+    benchmark, custom = records("a", {"BinFill": [1, 0]}), records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]})
+    (alone,) = aggregate(custom, Protocol(tasks_of(custom), 2, samples=100)).methods
+    assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean, alone.complete) == (75.0, 75.0, True)
+    tasks = ("BinFill", "TwoButtons", "Stay")
+    both = aggregate([*benchmark, *custom], Protocol(tasks, 2, samples=100))
+    (method,) = both.methods
+    assert (method.average.mean, method.figures["suite"]["Own tasks"].mean) == (50.0, 75.0)
+    assert method.figures["task"]["TwoButtons"].mean == 100.0 and method.complete
+    assert both.notes == []
+    assert tasks_of([*benchmark, *custom]) == (*PAPER_ORDER, "Stay", "TwoButtons")
+
+
+def test_the_command_shows_and_compares_own_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for record in [*records("pi05", {"TwoButtons": [1, 0]}), *records("b", {"TwoButtons": [0, 0]})]:
+            log.append(record)
+    page = tmp_path / "page.html"
+    main(["--brief", "--episodes", "2", str(tmp_path), "--html", str(page), "--samples", "100"])
+    displayed = capsys.readouterr().out
+    assert "Own tasks" in displayed and "50.00" in displayed and "TwoButtons" in page.read_text()
+
+
+# Comparison
+
+
+def test_a_comparison_pairs_the_episodes() -> None:
+    protocol = Protocol(("BinFill",), episodes=50, samples=500)
+    a, b = [1] * 30 + [0] * 20, [1] * 20 + [0] * 30
+    results = aggregate(records("a", {"BinFill": a}) + records("b", {"BinFill": b}), protocol)
+    result = compare(*results.methods, protocol)
+    assert (result.wins, result.losses, result.difference) == (10, 0, pytest.approx(20))
+    assert result.p == pytest.approx(2 / 2**10)
+    assert result.interval.low > 0
+    assert "a is significantly better than b" in result.verdict
+    # The same two rates on other episodes: 30 against 20 differing pairs are no longer significant.
+    shifted = aggregate(records("a", {"BinFill": a}) + records("b", {"BinFill": b[::-1]}), protocol)
+    other = compare(*shifted.methods, protocol)
+    assert (other.wins, other.losses) == (30, 20)
+    assert not other.significant
+    assert "no significant difference" in other.verdict
+
+
+def test_agreeing_repeats_of_a_run_add_no_evidence() -> None:
+    protocol = Protocol(("BinFill",), episodes=50, samples=500)
+    a, b = [1] * 5 + [0] * 45, [0] * 50
+    once = aggregate(records("a", {"BinFill": a}) + records("b", {"BinFill": b}), protocol)
+    many = [
+        r for seed in range(9) for name, wins in (("a", a), ("b", b)) for r in records(name, {"BinFill": wins}, seed)
+    ]
+    again = aggregate(many, protocol)
+    assert compare(*again.methods, protocol).p == compare(*once.methods, protocol).p == pytest.approx(0.0625)
+
+
+def test_several_comparisons_are_corrected(demo: Results) -> None:
+    pair = (demo.methods[0], demo.methods[1])
+    (alone,), (first, _) = compare_all([pair], demo.protocol), compare_all([pair, pair[::-1]], demo.protocol)
+    assert first.corrected == pytest.approx(min(1, 2 * alone.p))
+    with pytest.raises(UserError, match="with itself"):
+        compare(pair[0], pair[0], demo.protocol)
+
+
+# Output
+
+
+def test_the_leaderboard_has_sixteen_rows_three_seeds_and_their_average(demo: Results) -> None:
+    boards = leaderboard(demo.method("framesamp_modul"), demo)
+    assert len(boards) == 3  # checkpoints
+    assert boards[0].columns == ["Task", "Seed 7", "Seed 42", "Seed 0", "Average"]
+    assert len(boards[0].rows) == 17
+    for row in boards[0].rows:
+        *seeds, average = map(float, row[1:])
+        assert average == pytest.approx(np.mean(seeds), abs=0.011)
+    assert to_markdown(boards[0]).count("\n| ") == 19  # and two lines of head
+
+
+def test_csv_holds_the_figures_and_latex_escapes(demo: Results) -> None:
+    rows = list(csv.DictReader(to_csv(demo).splitlines()))
+    row = next(r for r in rows if (r["method"], r["kind"]) == ("framesamp_modul", "average"))
+    assert float(row["mean"]) == pytest.approx(demo.method("framesamp_modul").average.mean, abs=1e-3)
+    assert float(row["paper_mean"]) == pytest.approx(44.51, abs=0.005)
+    assert len(rows) == 2 * (16 + 4 + 6 + 1 + 3)
+    latex = to_latex(overview(demo))
+    assert r"framesamp\_modul" in latex
+    assert r"95 \%" in latex
+    assert r"$\pm$" in latex
+
+
+def test_the_command_reads_shards_and_saves_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    for shard in range(2):
+        with RecordLog(run / f"episodes-{shard}.jsonl") as log:
+            for name, wins in (("pi05", [1, 0, 0, 0]), ("ttt_modul", [1, 1, 0, 1])):
+                for made in records(name, {"BinFill": wins, "MoveCube": wins})[shard::2]:
+                    log.append(made)
+    files = {kind: tmp_path / "out" / f"results.{kind}" for kind in ("csv", "latex", "markdown", "html")}
+    options = [part for kind, path in files.items() for part in (f"--{kind}", str(path))]
+    main([str(run), "--tasks", "BinFill", "MoveCube", "--episodes", "4", "--samples", "50", *options])
+    printed = capsys.readouterr().out
+    assert "75.00" in printed
+    assert "no significant difference between pi05 and ttt_modul" in printed  # two methods are compared unasked
+    page = files["html"].read_text()
+    assert page.count("<svg") >= 5
+    assert "<script" not in page
+    assert 'src="http' not in page
+    assert all(path.stat().st_size > 100 for path in files.values())
+
+
+def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
+    wins = {"BinFill": [1, 0], "MoveCube": [1, 1]}
+    config = {"memory": {"name": "ttt", "budget": 512}, "integration": {"name": "expert"},
+              "card": {"data": "robomme", "recipe": {"steps": 80000, "batch_size": 64, "lr": 5e-5}}}  # fmt: skip
+    claim_run(tmp_path / "a", {"model": "ttt_expert", "checkpoint": 100}, {"policy": policy_facts(config)})
+    for folder, name in (("a", "ttt_expert"), ("b", "pi05")):
+        with RecordLog(tmp_path / folder / "episodes.jsonl") as log:
+            for seed in (7, 42):
+                for made in records(name, wins, seed):
+                    log.append(made)
+    out = tmp_path / "out.md"
+    options = [
+        "--tasks",
+        "BinFill",
+        "MoveCube",
+        "--episodes",
+        "2",
+        "--samples",
+        "50",
+        "--brief",
+        "--markdown",
+        str(out),
+    ]
+    main([str(tmp_path / "a"), str(tmp_path / "b"), *options])
+    _, _, details = out.read_text().partition("## Training details")
+    trained, unknown = details.split("**pi05")
+    assert "memory ttt, 512 tokens, integration expert" in trained and "data: robomme" in trained
+    assert "updates 80000, samples an update 64, peak learning rate 5e-05" in trained
+    assert "joint_angle actions, at most 1300 steps, model seeds 7, 42" in trained
+    assert unknown.count("state it manually") == 2
+
+
+@pytest.mark.usefixtures("sampled_once")
+def test_the_demo_says_that_it_is_made_up(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--demo", "--brief", "--samples", "20"])
+    assert "Made-up records" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("sampled_once")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [([], "Name files or folders"), (["nowhere"], "does not exist"),
+     (["--demo", "--samples", "20", "--compare", "pi05", "pi06"], "pi06"),
+     (["--demo", "--tasks", "Binfill"], "Did you mean 'BinFill'")],
+)  # fmt: skip
+def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_demo_draws_around_the_papers_rates(demo: Results) -> None:
+    method = demo.method("groundsg+qwenvl")
+    assert method.average.mean == pytest.approx(32.7, abs=2)
+    assert json.loads(demo_records([("pi05", None)], episodes=1)[0].to_json())["extra"] == {"made_up": True}
+
+
+def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for made in [*records("pi05", {"BinFill": [1, 0]}), *records("ttt_modul", {"MoveCube": [1, 1]})]:
+            log.append(made)
+    options = [str(tmp_path), "--tasks", "BinFill", "MoveCube", "--episodes", "2", "--samples", "20", "--brief"]
+    main(options)
+    printed = capsys.readouterr().out
+    assert "incomplete (2 of 4)" in printed
+    assert "pi05 and ttt_modul have no episode in common, and are not compared." in printed
+    with pytest.raises(SystemExit) as ended:
+        main([*options, "--compare", "pi05", "ttt_modul"])
+    assert ended.value.code == 2
+    assert "nothing to pair" in capsys.readouterr().err
+
+
+def test_latex_escapes_comparison_signs() -> None:
+    assert r"$<$ 0.001 $>$" in to_latex(Table("p", ["p"], [["< 0.001 >"]]))
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ({"memory": {"name": "ttt"}, "card": {"recipe": {"lr": "1e-4", "steps": 5}}}, "peak learning rate 1e-4"),
+        ({"memory": {"budget": 64}, "card": {"recipe": {}}}, "memory without a name, 64 tokens"),
+        ({"memory": "ttt", "integration": "expert", "card": "manually"}, "memory ttt, integration expert"),
+        ({"card": {"recipe": "as released"}}, "training: as released"),
+    ],
+)
+def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(config: dict[str, object], said: str) -> None:
+    methods = aggregate(records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]}), SMALL).methods
+    run = {"settings": {"model": "a", "checkpoint": 100}, "notes": {"policy": policy_facts(config)}}
+    assert said in training_details(methods, [run])
+
+
+HOSTILE = "\x1b]0;title\x07\x1b[2J"
+
+
+def test_escape_sequences_of_names_do_not_reach_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for i, name in enumerate((f"a{HOSTILE}", f"b{HOSTILE}")):
+        with RecordLog(tmp_path / f"episodes-{i}.jsonl") as log:
+            for record in records(name, {"BinFill": [True, False]}):
+                log.append(record)
+    main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2"])
+    assert "\\x1b[2J" in (printed := capsys.readouterr().out)
+    assert "\x1b" not in printed and "\x07" not in printed
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / HOSTILE)])
+    assert "\\x1b[2J" in (printed := capsys.readouterr().err)
+    assert "\x1b" not in printed and "\x07" not in printed
+
+
+@pytest.mark.parametrize("start", ["=HYPERLINK(1)", "+1", "-1", "@SUM(1)", "\t=1", "\r=1"])
+def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
+    results = aggregate(records(start, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20))
+    rows = list(csv.DictReader(io.StringIO(to_csv(results), newline="")))
+    assert {row["method"] for row in rows} == {f"'{start.strip()}"}
+    assert {row["mean"] for row in rows} == {"100.0000"}
+
+
+@pytest.mark.parametrize(
+    ("name", "displayed"),
+    [
+        ("[x](javascript:alert(1))", "[x]\\(javascript:alert(1))"),
+        ("![x][y]", "![x]\\[y]"),
+        ("[x]: javascript:alert(1)", "[x]\\: javascript:alert(1)"),
+        ("<script>", "\\<script>"),
+        ("a\\](b)", "a\\\\]\\(b)"),
+        ("a|b", "a\\|b"),
+        ("a\n# b", "a # b"),
+        ("[+1.0, +2.0]", "[+1.0, +2.0]"),
+    ],
+)
+def test_a_name_is_no_link_and_no_html_of_markdown(name: str, displayed: str) -> None:
+    assert (
+        to_markdown(Table(name, ["method"], [[name]])) == f"### {displayed}\n\n| method |\n| :--- |\n| {displayed} |\n"
+    )
+
+
+def test_training_details_hold_no_link_of_a_name() -> None:
+    name = "[x](javascript:alert(1))"
+    results = aggregate(records(name, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20))
+    assert "](" not in training_details(results.methods, [])
+
+
+def test_a_name_with_dollar_signs_is_text_in_the_figures(tmp_path: Path) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for record in records(r"$\nonsense$", {"BinFill": [True, False]}):
+            log.append(record)
+    main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2", "--html", str(tmp_path / "page.html"), "--brief"])
+    assert r"$\nonsense$" in (tmp_path / "page.html").read_text()

@@ -1,0 +1,292 @@
+"""A whole run: killed and gone on with, dying workers, shards, videos, the command."""
+
+import importlib.util
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from helpers import commands
+from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation
+from helpers.scripted_env import make_mortal_env, make_moving_env
+from mme_vla import UserError
+from mme_vla.cli.evaluate import choose_device
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.evaluation import (
+    Shard,
+    checkpoint_label,
+    choose_episodes,
+    choose_shard,
+    default_output,
+    memory_budget,
+)
+from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import Claims, find_records, read_records
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import random_batch
+from mme_vla.utils.media import BORDER, RED, video_frame
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy after two updates, saved."""
+    policy = quick_policy("framesamp_modul", memory={"budget": 64})
+    optimizer = torch.optim.AdamW(policy.parameters(), 1e-3)
+    policy.train()
+    for step in range(2):
+        optimizer.zero_grad()
+        policy(random_batch(policy, 1, seed=step))[0].backward()
+        optimizer.step()
+    folder = tmp_path_factory.mktemp("policy") / "step_000003"
+    policy.eval().save_pretrained(folder)
+    return folder
+
+
+def outcomes(folder: Path) -> dict:
+    """What must not depend on how a run came about; the last is exact to the last bit."""
+    records = [record for path in find_records([folder]) for record in read_records(path)]
+    return {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records if r.outcome != "error"}
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp_path: Path) -> None:
+    policy = MMEPolicy.from_pretrained(str(checkpoint))
+    straight = run_evaluation(policy, tmp_path / "whole")
+    assert len(straight.records) == len(JOBS) == 6
+    assert len({record.outcome for record in straight.records}) > 1, "the episodes should differ"
+
+    folder, records = tmp_path / "killed", tmp_path / "killed" / "episodes.jsonl"
+    run = commands.start("helpers.rollout_fakes", str(folder), str(checkpoint), "0.05")
+    try:
+        until = time.monotonic() + 120
+        while not records.exists() or records.read_bytes().count(b"\n") < 2:
+            assert run.poll() is None and time.monotonic() < until
+            time.sleep(0.02)
+    finally:
+        run.kill()
+        assert commands.finish(run).returncode == -signal.SIGKILL
+    with records.open("ab") as file:
+        file.write(b'{"model":"tiny","che')  # as if it had been writing
+    with pytest.warns(UserWarning, match="half-written"):
+        before = [(r.key, r.when) for r in read_records(records)]
+    assert 2 <= len(before) < 6
+
+    with pytest.warns(UserWarning, match="half-written"):
+        resumed = run_evaluation(policy, folder)
+    after = read_records(records)
+    assert [(r.key, r.when) for r in after[: len(before)]] == before, "what was finished was run again"
+    assert len(after) == len(resumed.records) == 6
+    assert outcomes(folder) == outcomes(tmp_path / "whole")
+    assert run_evaluation(policy, folder).workload.batches == 0, "nothing was left to do"
+
+
+def test_a_dying_worker_is_an_error_that_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = quick_policy("pi05")
+    (tmp_path / "graves").mkdir()
+    monkeypatch.setenv("GRAVES", str(tmp_path / "graves"))
+    at_once = run_evaluation(policy, tmp_path / "a", make_mortal_env, jobs=JOBS[1:3])
+    records = read_records(tmp_path / "a" / "episodes.jsonl")
+    (error,) = [record for record in records if record.outcome == "error"]
+    assert error.key == ("PickXtimes", 1) and "exit code 3" in error.error and error.steps == 16
+    assert len(records) == 3 and {record.outcome for record in at_once.records} == {"timeout"}
+
+    (tmp_path / "graves" / "PickXtimes-1").unlink()
+    later = run_evaluation(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
+    assert [r.key for r in later.records if r.outcome == "error"] == [("PickXtimes", 1)]
+    resumed = run_evaluation(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
+    assert {record.outcome for record in resumed.records} == {"timeout"}
+    assert outcomes(tmp_path / "b").items() <= outcomes(tmp_path / "a").items()
+
+
+def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mme_vla.evaluation.rollout.evaluation as module
+
+    monkeypatch.setattr(module, "VecEnv", inline)
+    run_evaluation(quick_policy("pi05"), tmp_path, jobs=JOBS[:1])
+    with pytest.raises(UserError, match=r"execute was 16, is 8"):
+        run_evaluation(quick_policy("pi05"), tmp_path, execute=8)
+    with pytest.raises(UserError, match=r"policy was"):
+        run_evaluation(quick_policy("framesamp_modul"), tmp_path)
+
+
+def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mme_vla.evaluation.rollout.evaluation as module
+
+    monkeypatch.setattr(module, "VecEnv", inline)
+    policy = quick_policy("pi05")
+    settings = RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
+    for folder in (tmp_path / "runs" / "seed7", tmp_path / "runs"):  # the second lies above the first
+        done = module.evaluate(policy, JOBS[:1], folder, FACTS, settings, base=make_moving_env, show_progress=False)
+        assert done.workload.batches > 0 and len(done.records) == 1
+    foreign = tmp_path / "runs" / "episodes-foreign.jsonl"
+    other = EpisodeRecord("tiny", "untrained", 7, "PickXtimes", 1, 1, "easy", "success", 5)
+    foreign.write_text(other.to_json() + "\n")
+    done = module.evaluate(
+        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_moving_env, show_progress=False
+    )
+    assert done.workload.batches > 0 and {record.model_seed for record in done.records} == {42}
+    assert module.evaluate(
+        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_moving_env, show_progress=False
+    ).workload.batches == 0  # fmt: skip
+
+
+def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mme_vla.evaluation.rollout.evaluation as module
+
+    monkeypatch.setattr(module, "VecEnv", inline)
+    policy, settings = quick_policy("pi05"), RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
+    left = [2, 2]  # how many the first process may begin; the other does the rest
+    take = Claims.take
+
+    def at_most(claims: Claims, waiting):
+        index = int(claims.records[len("episodes-")])
+        left[index] -= 1
+        return take(claims, waiting) if left[index] >= 0 else None
+
+    monkeypatch.setattr(Claims, "take", at_most)
+    for index in range(2):
+        shard = Shard(index, 2)
+        mine = module.evaluate(
+            policy, JOBS[:4], tmp_path, FACTS, settings, shard=shard, base=make_moving_env, show_progress=False
+        )
+        assert len(mine.records) == 2
+    assert sorted(path.name for path in find_records([tmp_path])) == ["episodes-0of2.jsonl", "episodes-1of2.jsonl"]
+    both = outcomes(tmp_path)
+    run_evaluation(policy, tmp_path / "alone", make_moving_env, jobs=JOBS[:4])
+    assert both == outcomes(tmp_path / "alone")
+
+
+def inline(jobs, workers, factory, options, timeout):
+    class Inline(InlineEnvs):
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    return Inline(workers, **options)
+
+
+def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:
+    assert choose_shard(None, {}) == Shard(0, 1) and Shard(0, 1).file == "episodes.jsonl"
+    assert choose_shard(None, {"RANK": "2", "WORLD_SIZE": "4"}) == Shard(2, 4)
+    assert choose_shard("1/4", {"RANK": "2", "WORLD_SIZE": "4"}) == Shard(1, 4)
+    for wrong in ("4/4", "1", "a/b", "1/0"):
+        with pytest.raises(UserError, match="counted from 0"):
+            choose_shard(wrong, {})
+
+
+def test_a_process_of_torchrun_takes_its_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    assert choose_device("auto") == torch.device("cuda", 3)
+    assert choose_device("cuda:1") == torch.device("cuda", 1)
+    assert choose_device("cpu") == torch.device("cpu")
+
+
+def test_episodes_are_selected_by_name_number_or_list() -> None:
+    assert choose_episodes("StopCube", 2) == [Job("StopCube", "test", 0), Job("StopCube", "test", 1)]
+    assert [job.episode for job in choose_episodes(["StopCube"], [4, 1])] == [4, 1]
+    for tasks, episodes, message in (
+        ("StopCubes", None, "StopCube"), ([], None, "at least one"), (["BinFill", "BinFill"], None, "once"),
+        ("BinFill", 51, "has 50"), ("BinFill", [50], "0 to 49"), ("BinFill", [1, 1], "once"),
+        ("BinFill", "x", "not understood"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=message):
+            choose_episodes(tasks, episodes)
+
+
+def test_impossible_settings_are_refused_by_name() -> None:
+    for wrong in ({"workers": 0}, {"execute": 0}, {"max_steps": 1.5}, {"split": "tset"}, {"env": "robome"},
+                  {"video": "some"}, {"timeout_s": 0}, {"env": "official", "render": False}):  # fmt: skip
+        with pytest.raises(UserError, match=next(iter(wrong))):
+            RolloutSettings(**wrong)
+
+
+def test_environments_that_cannot_begin_stop_the_run() -> None:
+    class Broken(InlineEnvs):
+        def start(self, worker, job, **how):
+            from mme_vla.envs.vector.pool import Reply
+
+            self._replies.append(Reply.of_failure(worker, job, True, self.kind, "no scene"))
+
+    envs = Broken(2)
+    envs.kind = "UserError"
+    with pytest.raises(UserError, match="no scene"):
+        roll(quick_policy("pi05"), JOBS, envs)
+    envs = Broken(2)
+    envs.kind = "RuntimeError"
+    with pytest.raises(UserError, match="8 environments in a row"):
+        roll(quick_policy("pi05"), JOBS, envs)
+
+
+def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp_path: Path) -> None:
+    import av
+
+    options = {"base": make_moving_env, "videos": (str(tmp_path), "all")}
+    records = roll(quick_policy("pi05"), [Job("VideoUnmask", "test", 0)], InlineEnvs(**options))
+    (path,) = tmp_path.iterdir()
+    assert path.name == "VideoUnmask_ep0_success_pick_up_the_red_cube.mp4" == records[0].extra["video"]
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.average_rate == 30
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(stream)]
+    assert len(frames) == 22 + records[0].steps
+    red = [bool((frame[3, 20] - frame[3, 20].mean())[0] > 80) for frame in frames]
+    assert red == [True] * 21 + [False] * (len(frames) - 21)
+    failed = tmp_path / "failed"
+    options["videos"] = (str(failed), "failure")
+    roll(quick_policy("pi05"), [Job("VideoUnmask", "test", 0)], InlineEnvs(**options))
+    assert list(failed.iterdir()) == []
+
+
+def test_a_caption_stands_below_the_images() -> None:
+    front, wrist = np.zeros((64, 64, 3), np.uint8), np.full((64, 64, 3), 9, np.uint8)
+    bare, captioned = (video_frame([front, wrist], text) for text in (None, "press the button"))
+    assert bare.shape == (88, 128, 3) and np.array_equal(bare[:64], captioned[:64])
+    assert captioned[64:].max() > 200 and bare[64:].max() == 0
+    demo = video_frame([front, wrist], video=True)
+    assert (demo[:BORDER, :128] == RED).all() and (demo[BORDER : 64 - BORDER, BORDER : 128 - BORDER].max() <= 9)
+
+
+def test_runs_find_their_folder_by_what_they_are() -> None:
+    assert checkpoint_label("runs/a/checkpoints/step_000350") == 350
+    assert checkpoint_label("owner/pi05") == "pi05" and checkpoint_label(None) == "untrained"
+    assert str(default_output(FACTS)) == "outputs/evaluation/tiny/untrained/seed42"
+    assert memory_budget(quick_policy("framesamp_modul", memory={"budget": 64})) == 64
+    assert memory_budget(quick_policy("framesamp_modul")) is memory_budget(quick_policy("pi05")) is None
+
+
+def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.CaptureFixture) -> None:
+    def record(outcome: str, **changes) -> EpisodeRecord:
+        return EpisodeRecord("m", 1, 0, "BinFill", 0, 1, "easy", outcome, 5, **changes)
+
+    with RolloutProgress(4, [record("success")]) as progress:
+        progress.episode(record("error", error="it died"), again=True)
+        progress.episode(record("fail"))
+        progress.episode(record("error", error="it died"))
+        assert progress.summary == "success 1/3 = 33.3 % · 1 errors"
+    assert "tried again" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    importlib.util.find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed"
+)
+def test_the_command_evaluates_a_checkpoint_in_the_simulator(checkpoint: Path, tmp_path: Path) -> None:
+    words = [f"checkpoint={checkpoint}", "tasks=[StopCube]", "episodes=1", "max_steps=16", "render=false", "seed=7"]
+    done = commands.run("mme_vla.evaluate", *words, f"output={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    (record,) = read_records(tmp_path / "episodes.jsonl")
+    assert (record.model, record.checkpoint, record.model_seed) == ("framesamp_modul", 3, 7)
+    assert (record.outcome, record.steps, record.memory_budget) == ("timeout", 17, 64)
+    assert record.seconds.sim > 0 and record.seconds.policy > 0
+    assert "timeout" in done.stdout and "mme_vla.results" in done.stderr

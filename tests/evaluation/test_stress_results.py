@@ -1,0 +1,40 @@
+"""Success over the dials of a stress split: one curve is of the same episodes, and the test split is its zero."""
+
+from pathlib import Path
+
+import pytest
+
+from helpers.rollout_fakes import records
+from mme_vla.cli.results import main
+from mme_vla.errors import UserError
+from mme_vla.evaluation.results.curves import stress_curves, stress_figures
+from mme_vla.evaluation.store import RecordLog
+
+
+def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
+    made = [
+        *records("test", [1, 1, 1, 0]),
+        *records("stress:count=2", [1, 0, 0, 0]),
+        *records("stress:count=5", [0, 0]),
+    ]
+    made += [*records("stress:count=2", [1, 1], "other"), *records("twin", [1, 1])]
+    curves = stress_curves(made)
+    mine = next(points for (run, *_), points in curves.items() if run.startswith("m,"))
+    assert [(p.turned, p.won, p.episodes) for p in mine] == [(0, 2, 2), (2, 1, 2), (5, 0, 2)]
+    other = next(points for (run, *_), points in curves.items() if run.startswith("other"))
+    assert [(p.turned, p.rate) for p in other] == [(2, 100.0)]
+    assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
+
+
+def test_the_command_saves_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, made in (("a", records("test", [1, 0])), ("b", records("stress:count=3", [0, 0]))):
+        with RecordLog(tmp_path / name / "episodes.jsonl") as log:
+            for record in made:
+                log.append(record)
+    page = tmp_path / "page.html"
+    main([str(tmp_path), "--stress", "--html", str(page), "--title", "a < b"])
+    assert "Success over the dials" in capsys.readouterr().out
+    text = page.read_text()
+    assert "<svg" in text and "PickXtimes, count" in text and "<h1>a &lt; b</h1>" in text
+    with pytest.raises(UserError, match="None of these records is of a stress split"):
+        stress_curves(records("test", [1]))

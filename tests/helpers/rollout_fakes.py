@@ -1,0 +1,92 @@
+"""Rollouts of the scripted environment, in this process and in workers.
+
+Run as a script it is an evaluation to be killed: `python rollout_stand_ins.py <folder> <checkpoint> <seconds a step>`.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from helpers.scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
+from mme_vla.envs.vector.pool import Job, Reply
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.evaluation import Evaluation, evaluate
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import SMALL_VISION, small_policy
+
+FACTS = RunFacts("tiny", "untrained", 42, max_steps=24)
+JOBS = [Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for episode in range(3)]
+
+
+def quick_policy(name: str, patch_size: int = 16, **overrides: Any) -> MMEPolicy:
+    """A policy that sees little, and so answers at once; 8 is the largest patch that every memory can be built on."""
+    return small_policy(name, backbone={"vision": {**SMALL_VISION, "patch_size": patch_size}}, **overrides)
+
+
+class InlineEnvs:
+    """A `VecEnv` without processes; keeps every environment it made."""
+
+    def __init__(self, workers: int = 1, **options: Any) -> None:
+        self.workers = workers
+        self._options = {"base": make_scripted_env, "max_steps": 40, **options}
+        self._replies: list[Reply] = []
+        self._running: dict[int, tuple[Job, ChunkEnv]] = {}
+        self.made: dict[Job, ScriptedEnv] = {}
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._replies)
+
+    def start(self, worker: int, job: Job, **how: Any) -> None:
+        env = make_rollout_env(job.task, job.split, job.episode, **self._options)
+        self.made[job] = env._env
+        self._running[worker] = (job, env)
+        self._replies.append(Reply.of_outcome(worker, job, True, env.reset(**how)))
+
+    def send(self, worker: int, action: Any) -> None:
+        job, env = self._running[worker]
+        self._replies.append(Reply.of_outcome(worker, job, False, env.step(action)))
+
+    def recv(self, timeout: float | None = None) -> list[Reply]:
+        replies, self._replies = self._replies, []
+        return replies
+
+
+def roll(
+    policy: MMEPolicy,
+    jobs: list[Job],
+    envs: InlineEnvs,
+    subgoals: Any = None,
+    subgoal_folder: Path | None = None,
+    **settings: Any,
+) -> list[EpisodeRecord]:
+    """Records of a rollout in this process."""
+    records: list[EpisodeRecord] = []
+    options = RolloutSettings(**{"flow_steps": 2, **settings})
+    Rollout(policy, envs, FACTS, options, records.append, subgoals, subgoal_folder).run(jobs)
+    return records
+
+
+def run_evaluation(
+    policy: MMEPolicy, folder: Path, base: Any = make_slow_env, jobs: Sequence[Job] = JOBS, **settings: Any
+) -> Evaluation:
+    """These episodes in two worker processes."""
+    options = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
+    return evaluate(policy, jobs, folder, FACTS, options, base=base, show_progress=False)
+
+
+def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:
+    return [
+        EpisodeRecord(model, 1, seed, "PickXtimes", e, e, "easy", "success" if w else "fail", 9, split=split)
+        for e, w in enumerate(won)
+    ]
+
+
+if __name__ == "__main__":
+    os.environ["STEP_S"] = sys.argv[3]
+    run_evaluation(MMEPolicy.from_pretrained(sys.argv[2]), Path(sys.argv[1]))

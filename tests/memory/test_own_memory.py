@@ -1,0 +1,117 @@
+"""The worked example of docs/add-a-memory.md: a memory outside the package builds, streams and trains."""
+
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from helpers import REPOSITORY
+from mme_vla import UserError, build_policy
+from mme_vla.config.composition import compose
+from mme_vla.envs.rendering import render_backend
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.testing import check_memory
+from mme_vla.testing.small import open_gates, random_batch, unit_stats
+
+EXAMPLE = REPOSITORY / "examples" / "last_frames"
+
+
+@pytest.fixture
+def policy(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLE)
+    policy = build_policy("last_frames_context", config_dir=EXAMPLE / "configs")
+    policy.processor.stats = unit_stats()
+    open_gates(policy)
+    return policy
+
+
+def test_the_page_shows_the_files_that_are_tested():
+    page = (REPOSITORY / "docs" / "add-a-memory.md").read_text()
+    for file in ("last_frames.py", "configs/memory/last_frames.yaml", "configs/model/last_frames_context.yaml"):
+        assert (EXAMPLE / file).read_text().strip() in page, file
+
+
+def test_the_pages_memory_with_a_forward_of_its_own_passes_the_check():
+    page = (REPOSITORY / "docs" / "add-a-memory.md").read_text()
+    block = next(block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FrameMeans" in block)
+    exec(compile(block, "docs/add-a-memory.md", "exec"), {})
+    check_memory("frame_means", budget=6)
+
+
+def test_it_passes_the_check_that_the_page_names(policy):
+    check_memory("last_frames", budget=64, spacing=3)
+
+
+def test_its_file_makes_it_a_choice_for_any_integration_and_beside_another(monkeypatch):
+    monkeypatch.chdir(EXAMPLE)
+    trees = [EXAMPLE / "configs"]
+    cfg = compose("train", ["memory=last_frames", "integration=modulator", "memory.spacing=8"], extra_dirs=trees)
+    assert (cfg.plugins, cfg.memory.spacing, cfg.integration.name) == (["last_frames"], 8, "modulator")
+    joined = {"memory": ["last_frames", "framesamp"], "integration": "expert", "plugins": ["last_frames"]}
+    policy = build_policy("pi05", config_dir=trees[0], device="meta", **joined)
+    assert [type(member).__name__ for member in policy.memory.memories] == ["LastFrames", "FrameSamp"]
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "serve", "cache", "probe", "inspect", "record"])
+def test_every_command_takes_the_plugins_of_its_file(command):
+    assert compose(command, ["memory=last_frames"], extra_dirs=[EXAMPLE / "configs"]).plugins == ["last_frames"]
+
+
+@pytest.mark.slow
+def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    settings = [
+        "beside=[]", "also=[]", "drawn_for=[]", "planner=false", "films=false", "split=val", "episodes=1",
+        "max_steps=1", "demonstrations={easy: 2, medium: 0, hard: 0}", "train.steps=1", "train.batch_size=2",
+        "+memories.last_frames={budget: 4, grid: 1, spacing: 32}",
+    ]  # fmt: skip
+    words = ["task=VideoUnmask", "model=last_frames_context", "--config-dir", "configs", *settings]
+    command = [sys.executable, "-m", "mme_vla.nano", *words, f"output={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(command, cwd=EXAMPLE, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (record,) = read_folders(find_records([tmp_path]))
+    assert (record.model, record.memory_budget) == ("last_frames_context-grid_1-spacing_32", 4)
+    (weights,) = tmp_path.rglob("step_*/model.safetensors")
+    assert json.loads((weights.parent / "config.json").read_text())["plugins"] == ["last_frames"]
+
+
+def test_custom_memory_gets_a_loss_and_acts(policy):
+    batch = random_batch(policy, valid=32)
+    loss, _ = policy(batch)
+    loss.backward()
+    assert policy.memory.encoder.project.weight.grad.abs().sum() > 0
+    episode = policy.start_episode("press the button")
+    frames = np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), dtype=np.uint8)
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((9, 8), np.float32))
+    recalled = episode.gather_selection()
+    assert sorted(set(recalled.positions[recalled.mask][:, 0].tolist())) == [0, 4, 8]
+    assert torch.isfinite(torch.from_numpy(policy.act([episode]))).all()
+
+
+def test_custom_memory_trains_through_the_same_command(tmp_path, monkeypatch):
+    small = [
+        "backbone.depth=1",
+        "backbone.vision.depth=1",
+        "backbone.vision.image_size=16",
+        "backbone.vision.patch_size=1",
+    ]
+    brief = ["train.steps=2", "train.val_samples=2", "train.open_loop_chunks=1", "train.workers=0", "logger=none"]
+    options = ["model=last_frames_context", *small, *brief, f"hydra.run.dir={tmp_path / 'run'}"]
+    # As `python -m mme_vla.train` would, in a process that has imported the large packages already.
+    monkeypatch.setattr(sys, "argv", ["mme_vla.train", "--config-dir", str(EXAMPLE / "configs"), *options])
+    monkeypatch.syspath_prepend(EXAMPLE)
+    monkeypatch.chdir(EXAMPLE)
+    monkeypatch.delitem(sys.modules, "mme_vla.train", raising=False)
+    runpy.run_module("mme_vla.train", run_name="__main__", alter_sys=True)
+    assert list((tmp_path / "run").rglob("model.safetensors"))

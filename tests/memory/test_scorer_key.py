@@ -1,0 +1,38 @@
+"""The cache's key of frame scores follows from the scorer's class, code and options."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mme_vla.memory.history import FrameScorer
+from mme_vla.memory.tokendrop import ChangeScorer, TokenDrop
+
+
+class OtherRule(ChangeScorer):
+    """Scores twice the change."""
+
+    def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
+        values = super().__call__(frame_index, frame)
+        return None if values is None else 2 * values
+
+
+@dataclass
+class Brightness(FrameScorer):
+    """Mean of each frame."""
+
+    every: int = 2
+
+    def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
+        return None if frame_index % self.every else np.full(1, frame.mean(), np.float32)
+
+
+def test_released_rule_keeps_the_key_of_earlier_caches() -> None:
+    assert TokenDrop(64, 32).storage.scorer == ChangeScorer(8, 8).key == "change8x8-every8"
+
+
+def test_another_rule_or_option_has_another_key() -> None:
+    keys = {
+        scorer.key for scorer in (ChangeScorer(8, 8), ChangeScorer(8, 4), OtherRule(8, 8), Brightness(), Brightness(3))
+    }
+    assert len(keys) == 5
+    assert Brightness().key.startswith("brightness-every2-")

@@ -1,0 +1,236 @@
+"""MemoryVLA as a policy: groups of one episode, banks in the episode, training by the command."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.memoryvla_golden import reached
+from helpers.prior_vla_runs import losses, run
+from mme_vla import UserError, build_policy
+from mme_vla.data.dataset import GroupDataset
+from mme_vla.data.sources import open_sources
+from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
+from mme_vla.methods.memoryvla.processor import GroupBatch
+from mme_vla.policy.base import Policy
+from mme_vla.policy.tensor_files import load_tensors
+
+SMALL = {"vision": {"image_size": 28}}
+
+
+def tiny() -> MemoryVlaPolicy:
+    return reached(backbone={**SMALL}, processor={"group_size": 4})
+
+
+def frames(count: int, seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return {name: rng.integers(0, 256, (count, 32, 32, 3), dtype=np.uint8) for name in ("front", "wrist")}
+
+
+def states(count: int) -> np.ndarray:
+    return np.zeros((count, 8), np.float32)
+
+
+def groups(policy: MemoryVlaPolicy) -> GroupDataset:
+    return GroupDataset(open_sources(["sample"], policy.embodiment), policy.require_processor())
+
+
+def test_a_group_is_of_one_episode_in_the_order_of_time_and_sampled_anew_every_epoch() -> None:
+    policy = tiny()
+    data = groups(policy)
+    first, again = data[1], data[1]
+    assert np.array_equal(first["times"], again["times"])
+    assert len(first["times"]) == 4 and (np.diff(first["times"]) > 0).all()
+    data.set_epoch(1)
+    assert not np.array_equal(data[1]["times"], first["times"]) and data[1]["place"][1] == first["place"][1]
+    count = len(data.sources[0])
+    assert {data[i]["place"][1] for i in range(count)} == set(range(count))
+    assert len(data) % count == 0 and abs(len(data) * 4 - data.steps) <= 4 * count
+    with pytest.raises(IndexError):
+        data[len(data)]
+
+
+def test_the_group_before_a_step_is_where_the_policy_would_have_been_requested() -> None:
+    policy = tiny()
+    data = groups(policy)
+    _, _, frame = data.locate(30)
+    assert data.observation(30)["times"].tolist() == [max(frame, 0) - 8 * i for i in (3, 2, 1, 0)]
+
+
+def batch_of(policy: MemoryVlaPolicy, count: int = 2) -> GroupBatch:
+    data = groups(policy)
+    return policy.require_processor().collate([data[i] for i in range(count)])
+
+
+def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
+    policy = tiny()
+    batch = batch_of(policy)
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
+    loss, metrics = policy(batch, draws)
+    assert torch.equal(loss, policy(batch, draws)[0]) and metrics["loss"] == loss
+    loss.backward()
+    component = policy.finetune_spec.component_of
+    for part in ("vision", "vlm", "memory", "action"):
+        learned = [p for name, p in policy.named_parameters() if component(name) == part and p.grad is not None]
+        assert any(p.grad.abs().sum() > 0 for p in learned), part  # type: ignore[union-attr]
+
+
+@torch.no_grad()
+def test_images_are_changed_by_their_draws_alone_whatever_stands_beside_them() -> None:
+    policy = tiny().train()
+    batch = batch_of(policy)
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
+    draws_ = [draws | policy.augmentation_params(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    assert draws_[0]["changes"].shape == (2, 4, 6)
+    first, again, other = (policy(batch, each)[0] for each in draws_)
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    halves = [policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in draws_[0].items()}) for i in range(2)]
+    apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
+    assert abs(apart - first) < abs(other - first) / 20
+    assert policy.eval().augmentation_params(2, torch.Generator()) == {}
+
+
+@torch.no_grad()
+def test_groups_of_a_batch_and_their_padding_do_not_meet() -> None:
+    policy = tiny()
+    data, collate = groups(policy), policy.require_processor().collate
+    long, short = data[0], data.observation(0)
+    short = {**short, "moments": short["moments"][-1:], "times": short["times"][-1:]}
+    noise = {"noise": torch.randn(2, policy.horizon, policy.action_dim, generator=torch.Generator().manual_seed(0))}
+    together = policy.sample_actions(collate([long, short]), noise)
+    for i, item in enumerate((long, short)):
+        alone = policy.sample_actions(collate([item]), {"noise": noise["noise"][i : i + 1]})
+        torch.testing.assert_close(together[i : i + 1], alone, rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_actions_repeated_past_the_end_count_only_where_they_are_requested(monkeypatch) -> None:
+    policy = tiny()
+    data, collate = groups(policy), policy.require_processor().collate
+    baseline = collate([data[0], data.observation(data.steps - 1)])
+    data.mask_padding = True
+    batch = collate([data[0], data.observation(data.steps - 1)])
+    assert baseline.action_mask is None and batch.action_mask.shape == batch.actions.shape[:3]
+    counted = batch.action_mask[batch.valid].tile(policy.sizes.repeats, 1)
+    assert 0 < counted.sum() < counted.numel()
+    losses = torch.rand(counted.shape, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(policy.core, "copies_error", lambda *_: losses)
+    torch.testing.assert_close(policy(baseline)[0], losses.mean())
+    expected = torch.stack(
+        [row[valid].mean() if valid.any() else row.new_zeros(()) for row, valid in zip(losses, counted, strict=True)]
+    )
+    torch.testing.assert_close(policy(batch)[0], expected.mean())
+
+
+def test_acting_twice_at_one_frame_stores_one_entry_and_gives_the_same_chunk() -> None:
+    policy = tiny()
+    episode = policy.start_episode("press the button", seed=3)
+    episode.observe(frames(1), states(1))
+    start = episode.noise_state
+    chunk = policy.act(episode)
+    assert chunk.shape == (16, 8) and episode.banks.count == 0
+    episode.noise_state = start
+    np.testing.assert_array_equal(policy.act(episode), chunk)
+    episode.observe(frames(8, seed=1), states(8))
+    assert episode.banks.count == 1 and episode.pending is None
+    policy.act(episode)
+    episode.observe(frames(8, seed=2), states(8))
+    assert episode.banks.cognition.times.tolist() == [0, 1] == episode.banks.perceptual.times.tolist()
+
+
+@pytest.mark.parametrize(("length", "saved"), [(17, 2), (18, 3), (1, 0), (8, 1)])
+def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, saved: int) -> None:
+    """However the frames arrive: at once, or one by one."""
+    policy = tiny()
+    video, now = frames(length), frames(1, seed=1)
+    straight, parts = (policy.start_episode("press the button") for _ in range(2))
+    together = {name: np.concatenate([video[name], now[name]]) for name in video}
+    straight.observe(together, states(length + 1), is_demo=np.arange(length + 1) < length)
+    for i in range(length):
+        parts.observe({name: video[name][i : i + 1] for name in video}, states(1), is_demo=True)
+    parts.observe(now, states(1))
+    for episode in (straight, parts):
+        assert episode.banks.count == saved
+    torch.testing.assert_close(straight.banks.cognition.entries, parts.banks.cognition.entries, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(policy.act(straight), policy.act(parts), atol=1e-4)
+
+
+def test_episodes_in_one_batch_act_as_alone_and_their_past_matters() -> None:
+    policy = tiny()
+    chunks = {}
+    for batched in (True, False):
+        pair = [policy.start_episode("press the button", seed=i) for i in range(2)]
+        pair[0].observe(frames(1, seed=5), states(1))
+        policy.act(pair[0])
+        for episode in pair:
+            episode.observe(frames(1), states(1))
+        chunks[batched] = policy.act(pair) if batched else np.stack([policy.act(episode) for episode in pair])
+    np.testing.assert_allclose(chunks[True], chunks[False], atol=1e-4)
+    empty = policy.start_episode("press the button", seed=0)
+    empty.observe(frames(1), states(1))
+    empty.draw()
+    assert np.abs(policy.act(empty) - chunks[True][0]).max() > 1e-3
+
+
+@torch.no_grad()
+def test_acting_over_a_stream_equals_a_group_of_its_moments() -> None:
+    policy = tiny()
+    processor = policy.require_processor()
+    episode, images = policy.start_episode("press the button"), frames(3)
+    for i in range(3):
+        episode.observe({name: images[name][i : i + 1] for name in images}, states(1))
+        chunk = policy.act(episode)
+    ids, mask = processor.prompt("press the button")
+    clip, valid = processor.resized(images["front"])[None], torch.ones(1, 3, dtype=torch.bool)
+    group = GroupBatch(clip, ids.expand(1, 3, -1), mask.expand(1, 3, -1), torch.arange(3)[None], valid)
+    last = policy.start_episode("press the button")
+    draws = [last.draw() for _ in range(3)][-1]
+    normalised = policy.sample_actions(group, {"noise": draws["noise"][None]})
+    expected = processor.absolute_actions(normalised, torch.zeros(1, 8))[0].numpy()
+    np.testing.assert_allclose(chunk, expected, atol=1e-4)
+
+
+def test_a_prompt_ends_in_the_opening_piece_and_the_end_of_the_text() -> None:
+    processor = tiny().require_processor()
+    with pytest.warns(UserWarning, match="loses its end"):
+        cut = processor.prompt("press " * 200)
+    for ids, mask in (processor.prompt("press the button"), cut):
+        assert ids[mask][-2:].tolist() == [processor.tokenizer.piece("▁"), processor.tokenizer.end]
+
+
+def test_it_counts_on_meta_without_anything_to_show() -> None:
+    policy = build_policy("memoryvla", device="meta")
+    batch = policy.full_batch("meta")
+    assert policy(batch)[0].is_meta and policy.sample_actions(batch).shape == (1, 16, 8)
+
+
+def test_what_it_has_no_place_for_is_refused_in_words() -> None:
+    with pytest.raises(UserError, match="group_size=1: MemoryVLA's banks"):
+        build_policy("memoryvla", processor={"group_size": 1})
+    with pytest.raises(UserError, match="group_size must be a positive"):
+        build_policy("memoryvla", processor={"group_size": 0})
+
+
+def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:
+    policy = tiny()
+    policy.save_pretrained(tmp_path)
+    again = Policy.from_pretrained(tmp_path)
+    assert isinstance(again, MemoryVlaPolicy) and again.require_processor().samples.group_size == 4
+    batch, noise = batch_of(policy), {"noise": torch.randn(2, policy.horizon, policy.action_dim)}
+    assert torch.equal(policy.sample_actions(batch, noise), again.sample_actions(batch, noise))
+    with pytest.raises(ValueError, match="actions"):
+        policy(replace(batch, actions=None))
+
+
+def test_it_trains_by_the_command_and_resumes_where_it_stopped(tmp_path: Path) -> None:
+    small = ["backbone.vision.image_size=28", "processor.group_size=2", "train.batch_size=2", "backbone.head.depth=1"]
+    whole = run("memoryvla", tmp_path / "whole", *small, "train.steps=2", "train.open_loop_chunks=1")
+    parts, compared = tmp_path / "parts", [*small, "train.val_samples=0"]
+    run("memoryvla", parts, *compared, "train.steps=1")
+    resumed = run("memoryvla", tmp_path / "unused", *compared, "train.steps=2", f"resume={parts}")
+    assert losses(parts) == losses(tmp_path / "whole") and len(losses(parts)) == 2
+    after = load_tensors(resumed)
+    for name, tensor in load_tensors(whole).items():
+        assert torch.equal(tensor, after[name]), name

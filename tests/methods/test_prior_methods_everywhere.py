@@ -1,0 +1,235 @@
+"""Every prior method trains, resumes, is evaluated, served and probed as any policy of the library, at tiny size."""
+
+import io
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from helpers.h5_files import write_file
+from helpers.prior_vla_runs import TOWERS, losses, run
+from helpers.rollout_fakes import InlineEnvs, roll
+from helpers.scripted_env import ScriptedEnv, make_scripted_env
+from helpers.serving_fakes import Served, challenge
+from mme_vla.cli.inspect import show_checkpoint
+from mme_vla.config.composition import compose
+from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.hdf5 import find_files, list_episodes
+from mme_vla.data.sources import open_sources
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
+from mme_vla.evaluation.recordings import all_recordings
+from mme_vla.evaluation.results.paper import average, counted, paper_method
+from mme_vla.policy.base import Policy
+from mme_vla.probing import lines
+from mme_vla.probing.arms import read_arms
+from mme_vla.probing.lines import MomentLine
+from mme_vla.probing.offline import OfflineSettings, probe_offline
+
+SIDE, POSE = 64, np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
+LLAMA = [*TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32"]
+OFT = [*LLAMA, "backbone.vision.image_size=32", "backbone.vision.patch_size=2"]
+SHORT = {
+    "diffusion_policy": ["backbone.diffusion_steps=4", "backbone.widths=[16,32]", "backbone.picture=[40,40]"],
+    **{
+        f"openvla_oft{kind}": OFT for kind in ("", "_simplesg", "_groundsg", "_tokendrop_context", "_framesamp_context")
+    },
+    "memoryvla": [*LLAMA, "backbone.vision.image_size=28", "backbone.head.depth=1", "processor.group_size=3"],
+    "sam2act_plus": ["train.warmup=1"],
+}
+pytestmark = pytest.mark.filterwarnings("ignore:.*loses its end")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
+    """What a model is trained on and probed with: the sample, or recordings with depth for those that read it."""
+
+    @cache
+    def with_depth() -> str:
+        folder = tmp_path_factory.mktemp("keyframes")
+        write_file(folder / "record_dataset_VideoUnmask.h5", [40, 44], [12, 12], poses=True, depth=True)
+        convert(list_episodes(find_files([folder])), folder / "out", ConvertOptions(images="png", keyframes=True))
+        return str(folder / "out")
+
+    return lambda model: with_depth() if model == "sam2act_plus" else "sample"
+
+
+@pytest.fixture(scope="module")
+def trained(data: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The run of a model after one update."""
+    pytest.importorskip("diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines")
+
+    @cache
+    def one_update(model: str) -> Path:
+        folder = tmp_path_factory.mktemp(model) / "run"
+        update(model, data(model), folder, "train.steps=1")
+        return folder
+
+    return one_update
+
+
+def update(model: str, data: str, folder: Path, *words: str) -> Path:
+    """Train a model on two samples an update; the last checkpoint."""
+    small = [*SHORT[model], f"data.sources=[{data}]", "data.val_episodes=[]", "train.batch_size=2"]
+    small += ["train.val_samples=0", "train.open_loop_chunks=0", *words]
+    return run(model, folder, *small, short=["logger=none", "train.workers=0", "train.device=cpu", "train.log_every=1"])
+
+
+@pytest.fixture(scope="module")
+def loaded(trained: Callable[[str], Path]) -> Callable[[str], Policy]:
+    return cache(lambda model: Policy.from_pretrained(trained(model)).eval())
+
+
+class DepthEnv(ScriptedEnv):
+    """The scripted environment, seen with depth; a motion is four frames."""
+
+    motion = 4
+
+    def step(self, action: np.ndarray) -> Any:
+        self.actions.append(np.array(action))
+        return self._lists([self._frame() for _ in range(self.motion)]), 0.0, False, False, self._info("ongoing")
+
+    def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
+        return super()._lists(frames) | readings(len(frames), listed=True)
+
+
+def readings(count: int, listed: bool = False) -> dict[str, Any]:
+    """Depth and poses of both cameras, as an environment or a client sends them."""
+    rng = np.random.default_rng(count)
+    readings_: dict[str, Any] = {}
+    for camera in ("front", "wrist"):
+        readings_[f"{camera}_depth"] = rng.integers(400, 900, (count, SIDE, SIDE, 1)).astype(np.int16)
+        readings_[f"{camera}_camera_extrinsic"] = np.tile(POSE, (count, 1, 1))
+    return {f"{name}_list": list(values) for name, values in readings_.items()} if listed else readings_
+
+
+def make_depth_env(task: str, split: str, episode: int, max_steps: int, **options: Any) -> DepthEnv:
+    return DepthEnv(task, episode, max_steps, 1e9, 0.0, "")
+
+
+@pytest.mark.parametrize("model", SHORT)
+def test_it_trains_and_goes_on_from_its_checkpoint(
+    model: str, trained: Callable[[str], Path], data: Callable[[str], str]
+) -> None:
+    folder = trained(model)
+    last = update(model, data(model), folder.parent / "unused", "train.steps=2", f"resume={folder}")
+    assert len(losses(folder)) == 2 and np.isfinite(losses(folder)).all()
+    assert last == folder / "checkpoints" / "step_000002"
+
+
+@pytest.mark.parametrize("model", SHORT)
+def test_it_is_evaluated(model: str, loaded: Callable[[str], Policy]) -> None:
+    policy = loaded(model)
+    base = make_depth_env if policy.embodiment.readings else make_scripted_env
+    envs = InlineEnvs(
+        base=base, robot=policy.embodiment, max_steps=20, max_actions=getattr(policy, "max_actions", None)
+    )
+    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=20)
+    assert record.outcome in ("success", "fail", "timeout") and record.steps > 0 and record.extra["chunks"] > 0
+    assert record.action_space == policy.embodiment.action.space
+
+
+@pytest.mark.parametrize("model", SHORT)
+def test_it_is_served_what_it_answers_itself(model: str, loaded: Callable[[str], Policy]) -> None:
+    policy, robot = loaded(model), loaded(model).embodiment
+    rng = np.random.default_rng(0)
+    front, wrist = (rng.integers(0, 255, (5, SIDE, SIDE, 3), np.uint8) for _ in range(2))
+    states, beside = np.full((5, 8), 0.04, np.float32), readings(5)
+    images = {"front": front, "wrist": wrist} | {name: beside[name] for name in robot.readings}
+    episode = policy.start_episode("pick up the cube", seed=42)
+    episode.observe(images, states, np.arange(5) < 4)
+    expected = policy.act(episode, 2)
+    lists = {f"{name}_list": list(beside[name]) for name in robot.readings}
+    with Served(policy) as served, served.client() as client:
+        assert client.metadata["readings"] == list(robot.readings)
+        reply = client.infer(challenge(front, wrist, states, first=True, **lists))["actions"]
+    np.testing.assert_allclose(reply, expected[: robot.action.execute], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("model", SHORT)
+def test_it_is_probed_on_recordings(
+    model: str, loaded: Callable[[str], Policy], data: Callable[[str], str], tmp_path: Path
+) -> None:
+    policy = loaded(model)
+    recordings = all_recordings(open_sources([data(model)], policy.embodiment))
+    settings = OfflineSettings(draws=2, moments=2, flow_steps=2)
+    torch.manual_seed(0)
+    results = probe_offline(
+        policy, read_arms(["nodemo"]), recordings[:1], recordings, tmp_path / "lines.jsonl", settings
+    )
+    moments = [line for line in results if isinstance(line, MomentLine)]
+    assert len(moments) == 2 and {line.recording for line in moments} == {recordings[0].name}
+    assert all(np.isfinite(line.change) for line in moments)
+    assert lines.read(tmp_path / "lines.jsonl")[0] == results
+
+
+def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str], Policy]) -> None:
+    policy, frames, states = (
+        loaded("sam2act_plus"),
+        np.zeros((2, SIDE, SIDE, 3), np.uint8),
+        np.zeros((2, 8), np.float32),
+    )
+    lists = readings(2, listed=True)
+    request = challenge(frames, frames, states, first=True, **lists)
+    wrong = {
+        "lacks wrist_depth_list": {k: v for k, v in request.items() if k != "wrist_depth_list"},
+        "front_depth_list must have one entry for each of 2 frames": request | {"front_depth_list": []},
+        r"front_depth_list must hold arrays \[64, 64\]": request | {"front_depth_list": [np.zeros((8, 8))] * 2},
+        "front_depth_list must be millimetres": request | {"front_depth_list": [-d for d in lists["front_depth_list"]]},
+        r"wrist_camera_extrinsic_list must hold arrays \[3, 4\]": request | {"wrist_camera_extrinsic_list": ["x", "y"]},
+        "add_buffer has no place for them": {"add_buffer": True, "images": frames[:, None], "state": states},
+    }
+    with Served(policy) as served:
+        for reason, message in wrong.items():
+            with served.client() as client, pytest.raises(UserError, match=reason):
+                client.infer(message)
+
+
+def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(loaded: Callable[[str], Policy]) -> None:
+    policy, image = loaded("sam2act_plus"), np.full((SIDE, SIDE, 3), 9, np.uint8)
+    beside = readings(1)
+    episode = policy.start_episode("pick up the cube", seed=42)
+    episode.observe({"front": image[None], "wrist": image[None], **beside}, np.full((1, 8), 0.04, np.float32))
+    message = {"observation/image": image, "observation/wrist_image": image, "prompt": "pick up the cube"}
+    message |= {"observation/state": np.full(8, 0.04, np.float32)}
+    message |= {f"observation/{name}": values[0] for name, values in beside.items()}
+    with Served(policy) as served, served.client() as client:
+        np.testing.assert_array_equal(client.infer(message)["actions"], policy.act(episode))
+        client.infer(message)
+        client.reset()
+        np.testing.assert_array_equal(client.infer(message)["actions"], policy.act(episode))
+
+
+def test_a_sam2act_episode_ends_after_its_waypoints(loaded: Callable[[str], Policy]) -> None:
+    policy = loaded("sam2act_plus")
+    assert policy.max_actions == policy.require_processor().waypoints == 40
+    envs = InlineEnvs(base=make_depth_env, robot=policy.embodiment, max_steps=10_000, max_actions=3)
+    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=10_000)
+    assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 3, 3 * DepthEnv.motion)
+
+
+@pytest.mark.parametrize("model", SHORT)
+def test_it_is_explained_by_inspect_and_stands_beside_its_paper_row(model: str, trained: Callable[[str], Path]) -> None:
+    console = Console(record=True, width=200, file=io.StringIO())
+    show_checkpoint(trained(model), console)
+    output = console.export_text()
+    assert all(word in output for word in ("parameters", "action", "normalisation", model))
+    subgoal = {"openvla_oft_simplesg": "qwenvl", "openvla_oft_groundsg": "qwenvl"}.get(model)
+    method = paper_method(model, subgoal)
+    assert method is not None and method.family == "prior" and 0 <= average(method.name).mean < 30
+    cost = counted()[model]
+    assert cost.chunk > 0 and cost.parameters > 10**7
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name"),
+    [("diffusion_policy", "diffusion_policy"), ("openvla_oft", "openvla_oft"), ("memoryvla", "memoryvla"),
+     ("sam2act_first", "sam2act_plus"), ("sam2act_memory", "sam2act_plus")],
+)  # fmt: skip
+def test_a_recipe_at_full_size_has_the_name_that_the_papers_row_has(recipe: str, name: str) -> None:
+    assert compose("train", [f"experiment={recipe}"]).name == name

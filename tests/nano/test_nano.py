@@ -1,0 +1,211 @@
+"""The nano backbone, its tower and its tokens; and what stands between demonstrations and training."""
+
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load
+
+from helpers import REPOSITORY
+from helpers.nano_policies import demonstration, nano
+from mme_vla import UserError, build_policy
+from mme_vla.backbone.nano_vision import CLASSES, WEIGHTS
+from mme_vla.cli import nano as nano_command
+from mme_vla.cli.nano import check_counts, with_settings
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.aggregate import wilson
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.memory.framesamp import FrameSamp
+from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.nano.learning import Decisions, SparseHistory, statistics
+from mme_vla.nano.page import LEVELS
+from mme_vla.nano.pretraining import class_words
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing import check_backbone
+
+SMALL = {
+    "vision": {"image_size": 32, "width_32": 8, "width_16": 8, "width_8": 8, "pretrained": False},
+    "vlm": {"width": 16, "mlp_dim": 16}, "action": {"width": 16, "mlp_dim": 16}, "num_heads": 2, "head_dim": 8,
+    "vocab_size": 64,
+}  # fmt: skip
+
+
+def test_it_keeps_a_backbones_contract() -> None:
+    check_backbone("nano", **SMALL)
+
+
+@pytest.mark.parametrize("model", ["pi05", "framesamp_context", "framesamp_modul", "framesamp_expert", "ttt_modul"])
+def test_every_composition_has_under_five_million_parameters(model: str) -> None:
+    assert sum(p.numel() for p in nano(model).parameters()) < 5e6
+
+
+def test_the_shipped_tower_weighs_under_six_megabytes_and_other_sizes_are_refused() -> None:
+    assert len(files("mme_vla").joinpath(WEIGHTS).read_bytes()) < 6e6
+    with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
+        build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})
+
+
+def test_the_shipped_tower_names_what_is_where() -> None:
+    """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far from it."""
+    tower = nano("pi05").backbone.vision
+    image = torch.full((1, 3, 128, 128), 0.3)
+    image[0, :, 52:60, 66:74] = torch.tensor([0.7, -0.9, -0.9])[:, None, None]
+    with torch.no_grad():
+        shares = tower.answers(image)[0].softmax(2)[0]  # token, class, place
+    red = shares[:, CLASSES.index("red cube")].amax(-1).view(8, 8)
+    assert red.argmax() == 3 * 8 + 4 and red[3, 4] > 0.5
+    assert shares[:, CLASSES.index("green cube")].max() < 0.5
+
+
+def test_a_fresh_tower_knows_the_words_that_the_shipped_one_knows() -> None:
+    words = load(files("mme_vla").joinpath(WEIGHTS).read_bytes())["words"].float()
+    assert torch.equal(class_words(), words) and words.sum() == 3
+
+
+def test_framesamp_stores_every_eighth_frame_alone_when_configured() -> None:
+    memory = FrameSamp(16, 16, budget=256, grid=8, every=8)
+    assert memory.chosen(66).tolist() == [0, 15, 39, 63]
+    assert memory.chosen(5).tolist() == [0]
+    assert all(memory.storage.keeps(int(frame)) for frame in memory.chosen(300))
+    assert FrameSamp(16, 16, budget=256, grid=8).chosen(66).tolist() == [0, 22, 44, 66]
+
+
+def test_framesamp_names_the_frames_it_will_read_also_when_it_stores_every_eighth_alone() -> None:
+    memory = FrameSamp(d_vision=8, width=8, budget=4, grid=1, every=8)
+    for step in (0, 5, 66, 200):
+        assert memory.frames_read([step], 30).tolist() == sorted(set(memory.chosen(step).tolist()))
+        assert set(memory.frames_read([step], 30)) <= set(memory.storage.stored_frames(step + 1))
+
+
+def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
+    made = demonstration()
+    made.save(tmp_path / "a.npz")
+    read = Demonstration.load(tmp_path / "a.npz")
+    assert (read.goal, read.length, read.exec_start) == (made.goal, made.length, made.exec_start)
+    assert np.array_equal(read.motions.targets, made.motions.targets) and read.subgoals == made.subgoals
+    assert list(read.images) == ["front"] and np.array_equal(read.images["front"][66], made.images["front"][66])
+
+
+def test_a_frame_that_was_not_rendered_is_refused() -> None:
+    policy = nano()
+    policy.require_processor().stats = statistics([demonstration()], policy)
+    with pytest.raises(UserError, match=r"\[39\]"):
+        Decisions.of(policy, [demonstration((0, 15, 47, 63, 66, 79, 95, 119, 120, 151, 155))])
+
+
+def test_decisions_are_the_samples_and_hold_what_an_episode_would_show() -> None:
+    policy, made = nano().eval(), demonstration()
+    policy.require_processor().stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).collate([0, 1, 2])
+    assert batch.actions is not None and batch.action_mask is not None
+    assert batch.action_mask.sum(1).tolist() == [3, 2, 1]
+    episode = policy.start_episode(made.goal)
+    frames = np.stack([made.images["front"].get(frame, made.images["front"][0]) for frame in range(67)])
+    episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
+    history = episode.gather_selection()
+    assert batch.history is not None
+    assert torch.equal(history.features, batch.history.features[0])
+    assert torch.equal(history.positions, batch.history.positions[0])
+
+
+def test_tokens_made_beforehand_give_the_loss_of_the_images() -> None:
+    policy, made = nano("pi05").eval(), demonstration()
+    processor = policy.require_processor()
+    processor.stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).collate([0, 1, 2])
+    images = processor.images([np.stack([made.images["front"][frame] for frame in (66, 120, 155)])])
+    draws = policy.training_noise(3, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        ready, from_images = policy(batch, draws)[0], policy(replace(batch, images=images, view_tokens=None), draws)[0]
+    assert torch.allclose(ready, from_images, atol=1e-5)
+
+
+def test_decisions_are_read_as_they_were_saved(tmp_path: Path) -> None:
+    policy = nano()
+    policy.require_processor().stats = statistics([demonstration()], policy)
+    made = Decisions.of(policy, [demonstration()])
+    made.save(tmp_path / "a.safetensors")
+    pairs = zip(made.batch.tensors(), Decisions.load(tmp_path / "a.safetensors").batch.tensors(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_numbers_that_hardly_move_keep_their_size() -> None:
+    policy = nano()
+    stats = statistics([demonstration()], policy)
+    assert (stats.actions.q99 - stats.actions.q01 >= 0.2 - 1e-9).all()
+
+
+def test_a_history_gives_only_what_it_has() -> None:
+    memory = FrameSamp(4, 4, budget=4, grid=1)
+    history = SparseHistory(memory.storage, 10, {0: torch.zeros(1, 4), 9: torch.ones(1, 4)}, 0)
+    assert history.gather(np.array([[9, 0]])).sum() == 4
+    with pytest.raises(UserError, match=r"\[5\]"):
+        history.gather(np.array([[5, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"), [({"easy": 1}, "takes two"), ({"simple": 4}, "easy"), (30, "how many of each"), ({}, "two")]
+)
+def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        check_counts(counts)
+
+
+def test_a_tasks_settings_come_with_its_name_unless_others_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "nano").mkdir()
+    (tmp_path / "nano" / "StopCube.yaml").touch()
+    monkeypatch.setattr(nano_command, "config_dir", lambda: tmp_path)
+    assert with_settings(["task=StopCube", "seed=1"]) == ["nano=StopCube", "task=StopCube", "seed=1"]
+    assert with_settings(["model=ttt_modul"]) == ["with_memory=ttt_modul"]
+    for words in (["task=BinFill"], ["seed=1"], ["task=StopCube", "nano=mine"]):
+        assert with_settings(words) == words
+    assert with_settings(["task=StopCube", "nano=null"]) == ["task=StopCube"]
+
+
+def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
+    policy = MMEPolicy.from_pretrained("nano")
+    assert policy.require_memory().budget == 4
+    made = demonstration()
+    episode = policy.start_episode(made.goal)
+    frames = np.stack([made.images["front"].get(frame, made.images["front"][0]) for frame in range(67)])
+    episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
+    assert policy.act(episode).shape == (4, 7)
+
+
+def test_what_the_goal_names_first_is_highlighted_in_images_and_memory() -> None:
+    backbone, processor = nano().backbone, nano().require_processor()
+    ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
+    unmarked, unmarked_mask = processor.prompt("press the button")
+    tokens = torch.arange(96.0).expand(2, 3, 96)
+    annotated = backbone.condition_on_prompt(tokens, torch.stack([ids, unmarked]), torch.stack([mask, unmarked_mask]))
+    assert annotated[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
+    assert torch.equal(annotated[1], tokens[1])
+
+
+def page_row(records: list[EpisodeRecord]) -> str:
+    """How the page's table begins a row of these records."""
+    rate = sum(record.success for record in records) / len(records)
+    interval = wilson(rate, len(records))
+    levels = [[record.success for record in records if record.difficulty == level] for level in LEVELS]
+    cell = f"**{100 * rate:.0f} %** ({100 * interval.low:.0f} … {100 * interval.high:.0f})"
+    return f"| {len(records)} | {cell} | " + " | ".join(f"{sum(part)}/{len(part)}" for part in levels) + " |"
+
+
+def test_the_pages_figures_follow_from_the_records() -> None:
+    page, folder = (REPOSITORY / "docs" / "evidence" / "nano.md").read_text(), REPOSITORY / "benchmarks" / "nano"
+    rows = sorted((folder / "VideoUnmask").iterdir())
+    assert len(rows) >= 4
+    for row in rows:
+        records = read_folders(find_records([row]))
+        assert {record.split for record in records} == {"further"}
+        assert f"| `{row.name}` {page_row(records)}" in page
+    shipped = {row.name: read_folders(find_records([row])) for row in (folder / "shipped").iterdir()}
+    assert {name: sum(r.success for r in records) for name, records in shipped.items()} == {
+        "framesamp_modul": 27, "pi05": 0,
+    }  # fmt: skip
+    assert "**54 %** (40 … 67; easy 19 of 26, medium 8 of 12, hard none of 12)" in page

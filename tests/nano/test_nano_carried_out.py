@@ -1,0 +1,61 @@
+"""Demonstrations carried out motion by motion show what a policy meets; and noise that hides last digits."""
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.nano_policies import demonstration, nano
+from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.envs import metadata
+from mme_vla.envs.make import make_env
+from mme_vla.envs.rendering import render_backend
+from mme_vla.errors import UserError
+from mme_vla.nano.demonstrations import record
+from mme_vla.nano.evaluating import Replay, replay
+from mme_vla.nano.learning import Decisions, statistics
+
+SCENE = {"seed": 3_000_001, "difficulty": "easy"}
+
+
+def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    made = record("SwingXtimes", choices=[], cameras=[], carried_out=True, **SCENE)  # type: ignore[arg-type]
+    assert made is not None
+    env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]
+    observation, _ = env.reset()
+    for number, (frame, target) in enumerate(zip(made.motions.decisions, made.motions.targets, strict=True)):
+        now = benchmark_state(observation["joint_state_list"][-1], observation["gripper_state_list"][-1])
+        assert np.allclose(made.states[frame], now, atol=1e-3), number
+        observation, _, ended, _, info = env.step(target)
+    env.close()
+    assert ended and info["status"] == "success"
+
+
+def test_noise_is_in_what_is_learned_and_not_in_what_is_requested() -> None:
+    policy, made = nano().eval(), demonstration()
+    policy.require_processor().stats = statistics([made], policy)
+    exact, noisy = (Decisions.of(policy, [made], noise=noise) for noise in (0.0, 0.2))
+    torch.manual_seed(0)
+    batch, shifted = exact.collate([0, 1, 2]), noisy.collate([0, 1, 2])
+    assert batch.state is not None and shifted.state is not None and batch.history and shifted.history
+    for before, after, std in (
+        (batch.view_tokens, shifted.view_tokens, 0.2),
+        (batch.history.features, shifted.history.features, 0.2),
+        (batch.state[:, :-1], shifted.state[:, :-1], 0.01),
+    ):
+        assert before is not None and after is not None
+        assert (after - before).std().item() == pytest.approx(std, rel=0.5)
+    assert torch.equal(batch.state[:, -1], shifted.state[:, -1])
+    assert batch.actions is not None and torch.equal(batch.actions, shifted.actions)  # type: ignore[arg-type]
+
+
+def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    spec = metadata.episode("VideoUnmask", "val", 0)
+    record = replay(Replay(spec, max_steps=500))
+    assert (record.model, record.outcome, record.seed) == ("planner", "success", spec.seed)
+    assert replay(Replay(spec, max_steps=record.steps // 2)).outcome == "timeout"

@@ -1,0 +1,143 @@
+"""A row of nanoMME: every kind of model learns from the same demonstrations, and the page tells how they did."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.nano_policies import demonstration
+from mme_vla import UserError, build_policy
+from mme_vla.cli.nano import demonstrate
+from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.nano import demonstrations
+from mme_vla.nano.demonstrations import Demonstration, Scene
+from mme_vla.nano.fitting import DONE
+from mme_vla.nano.learning import Decisions, position_error, statistics
+from mme_vla.nano.page import write_page
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.utils import write_json
+
+SMALL = {"framesamp": {"every": 8}, "tokendrop": {"stride": 8}, "ttt": {"stride": 16}, "rmt": {"stride": 16}}
+
+
+def nano(model: str) -> MMEPolicy:
+    memory = model.rsplit("_", 1)[0]
+    words = {"memory": {"budget": 4, "grid": 1, **SMALL[memory]}} if memory in SMALL else {}
+    return build_policy(model, backbone="nano", embodiment="robomme_waypoint_front", policy={"augment": False}, **words)
+
+
+def drawn_for(policy: MMEPolicy) -> Demonstration:
+    decisions = np.array([66, 120, 155])
+    return demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
+
+
+@pytest.mark.parametrize("memory", ["tokendrop", "ttt", "rmt"])
+def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
+    policy = nano(f"{memory}_modul").eval()
+    made = drawn_for(policy)
+    policy.require_processor().stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).collate([0])
+    images = made.images["front"]
+    episode = policy.start_episode(made.goal)
+    frames = np.stack([images.get(frame, images[0]) for frame in range(67)])
+    episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
+    history = episode.gather_selection()
+    assert batch.history is not None
+    for name in ("features", "positions", "mask"):
+        here, there = getattr(history, name).float(), getattr(batch.history, name)[0].float()
+        there = there[-len(here) :]  # later decisions read more frames, so that this one is padded on the left
+        assert torch.allclose(here, there, atol=0.01)  # encoded in other batches, and kept as bfloat16
+
+
+@pytest.mark.parametrize(("model", "words"), [("simplesg", "pick it up"), ("groundsg", "pick it up at <")])
+def test_a_model_that_reads_subgoals_learns_from_what_the_simulator_says(model: str, words: str) -> None:
+    policy = nano(model)
+    made = drawn_for(policy)
+    processor = policy.require_processor()
+    processor.stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).batch
+    baseline = Decisions.of(nano_like(policy), [made]).batch
+    assert batch.prompt_mask.sum() > baseline.prompt_mask.sum()
+    ids = batch.prompt[0][batch.prompt_mask[0]].tolist()
+    assert words in processor.tokenizer.decode(ids)
+
+
+def nano_like(policy: MMEPolicy) -> MMEPolicy:
+    other = nano("pi05")
+    other.require_processor().stats = policy.require_processor().stats
+    return other
+
+
+def test_the_error_is_measured_where_the_arm_goes_to_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = nano("pi05").eval()
+    made = drawn_for(policy)
+    policy.require_processor().stats = statistics([made], policy)
+    decisions = Decisions.of(policy, [made])
+    batch = decisions.collate(decisions.distant.nonzero()[:, 0].tolist())
+    assert batch.actions is not None
+    monkeypatch.setattr(policy, "sample_actions", lambda *_: batch.actions)
+    assert torch.equal(position_error(policy, decisions), torch.zeros(int(decisions.distant.sum())))
+    shifted = batch.actions.clone()
+    shifted[:, 0, 0] += 0.5  # of half the range that the statistics have
+    monkeypatch.setattr(policy, "sample_actions", lambda *_: shifted)
+    stats = policy.require_processor().require_stats().actions
+    half = 0.5 * float(stats.q99[0] - stats.q01[0]) / 2
+    assert position_error(policy, decisions).allclose(torch.full((int(decisions.distant.sum()),), half), atol=1e-4)
+
+
+def scenes(folder: Path, count: int, *choices: FrameChoice) -> list[Scene]:
+    return [Scene("VideoUnmask", seed, "easy", folder, ("front",), choices) for seed in range(count)]
+
+
+def test_scenes_are_demonstrated_until_there_are_enough_and_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def record(task: str, seed: int, *_: object) -> Demonstration | None:
+        tried.append(seed)
+        return None if seed == 1 else demonstration()
+
+    monkeypatch.setattr(demonstrations, "record", record)
+    results = demonstrate(iter(scenes(tmp_path, 9)), 3)
+    assert [path.stem for path in results] == ["easy-0", "easy-2", "easy-3"] and tried == [0, 1, 2, 3]
+    assert demonstrate(iter(scenes(tmp_path, 9)), 3) == results and tried == [0, 1, 2, 3]
+    other_memory = FrameChoice(DECISIONS, {"name": "framesamp", "budget": 4, "grid": 1, "every": 4})
+    demonstrate(iter(scenes(tmp_path, 9, other_memory)), 1)
+    assert tried == [0, 1, 2, 3, 0], "a demonstration without the frames of a new memory is made again"
+
+
+def test_scene_after_scene_without_a_demonstration_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demonstrations, "record", lambda *_: None)
+    with pytest.raises(UserError, match="20 easy scenes in a row, to seed 19"):
+        demonstrate(iter(scenes(tmp_path, 40)), 3)
+
+
+def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Path) -> None:
+    def records(model: str, won: int, count: int, budget: int | None = None) -> list[EpisodeRecord]:
+        return [
+            EpisodeRecord(model, 1, 7, "VideoUnmask", n, n, "easy", "success" if n < won else "timeout", 9,
+                          split="further", memory_budget=budget) for n in range(count)
+        ]  # fmt: skip
+
+    for model in ("framesamp_modul", "pi05", "ttt_modul"):
+        (tmp_path / model).mkdir()
+        write_json(tmp_path / model / DONE, {"off_by_m": [0.01, 0.02, 0.05]})
+        (tmp_path / model / "metrics.jsonl").write_text('{"step": 10, "val/loss": 0.5}\n')
+    config = {
+        "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4}, "train": {"steps": 20},
+        "policy_seeds": [7],
+    }  # fmt: skip
+    video = tmp_path / "films" / "a.mp4"
+    runs = {
+        "framesamp_modul": records("framesamp_modul", 60, 100, 4), "pi05": records("pi05", 5, 100),
+        "ttt_modul": records("ttt_modul", 20, 50, 4), "planner": records("planner", 100, 100),
+    }  # fmt: skip
+    page = write_page(tmp_path, config, runs, "pi05", {"videos": [2.0, 1.0]}, [video]).read_text()
+    assert "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
+    assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
+    assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page
+    assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
+    assert "| videos | 2.0 | 1.0 |" in page and (tmp_path / "learning.png").is_file()

@@ -1,0 +1,35 @@
+"""The model card as the hub reads it."""
+
+import pytest
+from huggingface_hub import ModelCard
+
+from mme_vla.policy.card import model_card
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import small_policy
+
+
+@pytest.fixture(scope="module")
+def policy() -> MMEPolicy:
+    return small_policy("pi05")
+
+
+@pytest.mark.parametrize("name", ["no", "null", "2026-11-21", "my: model", "- x", "framesamp_modul", "1e3"])
+def test_every_name_stays_a_name(policy: MMEPolicy, name: str) -> None:
+    data = ModelCard(model_card(policy, {**policy.config, "name": name})).data
+    assert data.tags[-1] == name and isinstance(data.tags[-1], str)
+    assert (data.library_name, data.pipeline_tag) == ("mme-vla", "robotics")
+    assert data.license is None and data.eval_results is None
+
+
+def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None:
+    known = {
+        "license": "apache-2.0",
+        "base_model": "lerobot/pi05_base",
+        "datasets": ["lerobot/robomme"],
+        "results": {"success_rate": 0.25, "note": "one seed"},
+    }
+    card = ModelCard(model_card(policy, {**policy.config, "card": known}))
+    assert (card.data.license, card.data.base_model) == ("apache-2.0", "lerobot/pi05_base")
+    assert card.data.datasets == ["lerobot/robomme"]
+    assert [(r.metric_type, r.metric_value) for r in card.data.eval_results] == [("success_rate", 0.25)]
+    assert "| note | one seed |" in card.text

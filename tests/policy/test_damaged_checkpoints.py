@@ -1,0 +1,171 @@
+"""Checkpoints whose files were damaged on the way: found before anything is computed, and said in one paragraph."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from mme_vla import MMEPolicy, UserError
+from mme_vla.policy.tensor_files import load_tensors, save_tensors
+from mme_vla.testing.small import SMALL_VISION, small_policy
+from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
+from mme_vla.training.optim import EMA
+from mme_vla.training.settings import KeepRule
+from mme_vla.utils import SUMS, check_sums, write_sums
+from mme_vla.weights import load_weights, start_from
+
+DEEP = "[" * 100_000
+
+
+def tiny() -> MMEPolicy:
+    return small_policy("pi05", backbone={"depth": 1, "vision": {**SMALL_VISION, "patch_size": 16}})
+
+
+def training(policy: MMEPolicy) -> tuple[MMEPolicy, EMA, torch.optim.Optimizer]:
+    parameters = trainable(policy)
+    return policy, EMA(parameters, 0.9), torch.optim.AdamW(parameters.values(), 1e-3)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A training checkpoint after one update."""
+    policy, ema, optimizer = training(tiny())
+    for parameter in policy.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    optimizer.step()
+    ema.update()
+    folder = tmp_path_factory.mktemp("run")
+    return save_checkpoint(folder, 1, policy, ema, optimizer, {"train": {"steps": 1}}, KeepRule())
+
+
+@pytest.fixture
+def checkpoint(intact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(intact, tmp_path / intact.name))
+
+
+def resume(checkpoint: Path) -> None:
+    read_state(checkpoint)
+    restore(checkpoint, *training(tiny()))
+
+
+def refusal(read: Callable[[Path], Any], folder: Path) -> str:
+    with pytest.raises(UserError) as caught:
+        read(folder)
+    assert len(str(caught.value)) <= 2000
+    return str(caught.value)
+
+
+def test_every_file_that_is_read_has_a_sum(checkpoint: Path) -> None:
+    listed = {line.split("  ")[1] for line in (checkpoint / SUMS).read_text().splitlines()}
+    assert listed == {path.name for path in checkpoint.iterdir()} - {SUMS, "README.md"}
+    assert check_sums(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        *((name, MMEPolicy.from_pretrained) for name in (
+            "model.safetensors", "config.json", "processor.json", "norm_stats.json", "tokenizer.model",
+        )),
+        *((name, resume) for name in (
+            "model.safetensors", "raw.safetensors", "optimizer.safetensors", "training_state.json",
+        )),
+        ("model.safetensors", lambda folder: load_weights(tiny(), folder)),
+        ("model.safetensors", lambda folder: start_from(tiny(), folder)),
+    ],
+)  # fmt: skip
+def test_one_flipped_bit_in_any_file_is_detected(name: str, read: Callable[[Path], Any], checkpoint: Path) -> None:
+    read(checkpoint)
+    data = bytearray((checkpoint / name).read_bytes())
+    data[-20] ^= 1
+    (checkpoint / name).write_bytes(data)
+    assert f"{name} is damaged" in refusal(read, checkpoint)
+
+
+def test_a_flipped_bit_in_one_shard_is_detected(tmp_path: Path) -> None:
+    policy = tiny()
+    policy.save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").unlink()
+    save_tensors(policy.state_dict(), tmp_path, max_shard_size="100KB")
+
+    write_sums(tmp_path)
+    MMEPolicy.from_pretrained(tmp_path)
+    shard = sorted(tmp_path.glob("model-*.safetensors"))[1]
+    data = bytearray(shard.read_bytes())
+    data[-1] ^= 128
+    shard.write_bytes(data)
+    assert f"{shard.name} is damaged" in refusal(MMEPolicy.from_pretrained, tmp_path)
+
+
+def test_a_checkpoint_from_before_there_were_sums_loads_without_a_word(
+    checkpoint: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    (checkpoint / SUMS).unlink()
+    MMEPolicy.from_pretrained(checkpoint)
+    resume(checkpoint)
+    assert list(recwarn) == []
+
+
+@pytest.mark.parametrize("content", [DEEP, "{", "[]", '{"a": 1' + "0" * 5000 + "}", "\ud800"], ids=range(5))
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("config.json", MMEPolicy.from_pretrained), ("processor.json", MMEPolicy.from_pretrained),
+        ("norm_stats.json", MMEPolicy.from_pretrained), ("training_state.json", resume),
+        ("model.safetensors.index.json", MMEPolicy.from_pretrained),
+    ],
+)  # fmt: skip
+def test_damaged_json_is_one_short_paragraph(
+    name: str, read: Callable[[Path], Any], content: str, checkpoint: Path
+) -> None:
+    (checkpoint / SUMS).unlink()
+    (checkpoint / name).write_bytes(content.encode("utf-8", "surrogatepass"))
+    assert name in refusal(read, checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("processor.json", {"prompt": []}), ("processor.json", {"views": [1]}), ("processor.json", {"horizon": 10**9}),
+        ("processor.json", {"tokenizer": None}), ("processor.json", {"stats": 3}), ("processor.json", {"x" * 9999: 1}),
+        ("processor.json", {"image_size": 3}), ("config.json", {"backbone": 3}), ("config.json", {"memory": [1]}),
+        ("config.json", {"policy": []}), ("config.json", {"adapters": {"rank": 0}}), ("config.json", {"plugins": [1]}),
+        ("config.json", {"plugins": 7}), ("config.json", {"integration": {"name": []}}),
+        ("norm_stats.json", {"norm_stats": {"state": {"mean": [10**400]}, "actions": {}}}),
+        ("norm_stats.json", {"norm_stats": {str(i): 0 for i in range(9999)}}),
+    ],
+)  # fmt: skip
+def test_values_of_the_wrong_kind_are_one_short_paragraph(name: str, changes: dict[str, Any], checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    content = json.loads((checkpoint / name).read_text())
+    (checkpoint / name).write_text(json.dumps({**content, **changes}))
+    refusal(MMEPolicy.from_pretrained, checkpoint)
+
+
+def test_thousands_of_names_are_one_short_paragraph(checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+    save_file({f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "model.safetensors")
+    assert "2,000 unexpected" in refusal(MMEPolicy.from_pretrained, checkpoint)
+    save_file({f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "raw.safetensors")
+    refusal(resume, checkpoint)
+
+
+def test_a_shard_with_a_name_of_thousands_of_letters_is_one_short_paragraph(tmp_path: Path) -> None:
+    (tmp_path / "model.safetensors.index.json").write_text(json.dumps({"weight_map": {"a": "x" * 5000}}))
+    with pytest.raises(UserError) as refused:
+        load_tensors(tmp_path)
+    assert len(str(refused.value)) < 1000
+
+
+def test_moments_that_are_no_numbers_are_refused(checkpoint: Path) -> None:
+    (checkpoint / SUMS).unlink()
+
+    moments = load_file(checkpoint / "optimizer.safetensors")
+    name = next(name for name in moments if name.endswith("exp_avg"))
+    save_file({**moments, name: moments[name] * float("nan")}, checkpoint / "optimizer.safetensors")
+    assert name in refusal(resume, checkpoint)

@@ -1,0 +1,321 @@
+"""What every composition has to do, whatever memory and integration it is made of."""
+
+import time
+
+import pytest
+import torch
+
+from mme_vla import UserError, build_policy
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
+from mme_vla.utils import SUMS
+
+TOLERANCE = 2e-5
+FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
+"""8×8 tokens a view; nothing here depends on their number."""
+MEMORY = {"budget": 128}
+
+
+@pytest.fixture(params=MODELS)
+def policy(request):
+    memory = {} if request.param == "pi05" else {"memory": MEMORY}
+    return small_policy(request.param, backbone=FEW_TOKENS, **memory)
+
+
+@pytest.fixture(params=NEURAL)
+def remembering(request):
+    return small_policy(request.param, backbone=FEW_TOKENS, memory=MEMORY)
+
+
+@torch.no_grad()
+def velocity(policy, batch, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(batch.actions.shape, generator=generator)
+    return policy.velocity(batch, noise, torch.full((len(noise),), 0.6))
+
+
+def test_tiny_policy_builds_in_under_a_second():
+    build_policy("pi05")  # imports are not part of building
+    for name in MODELS:
+        start = time.process_time()  # the clock would count what runs beside
+        build_policy(name)
+        assert time.process_time() - start < 1.0, name
+
+
+@pytest.mark.parametrize("size", ["position_dim", "position_hidden"])
+def test_a_width_of_zero_is_not_the_default(size):
+    with pytest.raises(UserError, match=rf"memory\.{size}=0: must be at least 1, or null"):
+        build_policy("framesamp_modul", memory={size: 0})
+
+
+@torch.no_grad()
+def test_cached_prefix_equals_the_joint_pass(policy):
+    batch = random_batch(policy)
+    noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(2))
+    time_ = torch.full((2,), 0.7)
+    prefix, injection = prefill(policy, batch)
+    action = policy.backbone.action_block(noise)
+    layout = policy.backbone.transformer.layout([action], policy.integration.visibility, prefix)
+    cached = policy.backbone.denoise(noise, policy.backbone.time_condition(time_), layout, prefix, injection)
+    assert (cached - policy.velocity(batch, noise, time_)).abs().max() < TOLERANCE
+
+
+def test_masked_history_cannot_change_the_action(remembering):
+    batch = random_batch(remembering, valid=100)
+    before = velocity(remembering, batch)
+    hidden = ~batch.history.mask
+    assert hidden.any()
+    batch.history.features[hidden] = 1e3
+    batch.history.positions[hidden] = 77
+    assert torch.allclose(velocity(remembering, batch), before, atol=TOLERANCE)
+
+
+def test_remembered_history_changes_the_action(remembering):
+    batch = random_batch(remembering, valid=100)
+    before = velocity(remembering, batch)
+    batch.history.features[batch.history.mask] += 3.0
+    assert (velocity(remembering, batch) - before).abs().max() > 1e-4
+
+
+def test_order_of_time_matters_through_positions_alone(remembering):
+    batch = random_batch(remembering, valid=100)
+    before = velocity(remembering, batch)
+    mask = batch.history.mask[0]
+    batch.history.positions[:, mask, 0] = batch.history.positions[:, mask, 0].flip(1)
+    assert (velocity(remembering, batch) - before).abs().max() > 1e-6  # fresh slots hardly move yet
+
+
+def test_padding_of_the_prompt_never_matters(policy):
+    batch = random_batch(policy)
+    before = velocity(policy, batch)
+    batch.prompt = torch.where(batch.prompt_mask, batch.prompt, 99)
+    assert torch.allclose(velocity(policy, batch), before, atol=TOLERANCE)
+
+
+def test_a_hidden_view_never_matters(policy):
+    batch = random_batch(policy)
+    batch.image_mask[:, 1] = False
+    before = velocity(policy, batch)
+    batch.images[:, 1] = 255 - batch.images[:, 1]
+    assert torch.allclose(velocity(policy, batch), before, atol=TOLERANCE)
+
+
+def test_batch_equals_each_alone(policy):
+    batch = random_batch(policy, batch=3)
+    together = velocity(policy, batch)
+    for i in range(3):
+        alone = batch._map(lambda x, i=i: x[i : i + 1])
+        noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(1))[i : i + 1]
+        with torch.no_grad():
+            one = policy.velocity(alone, noise, torch.full((1,), 0.6))
+        assert (one - together[i : i + 1]).abs().max() < TOLERANCE
+
+
+def test_loss_reaches_every_trainable_parameter(policy):
+    """What no action reads is not there: no parameter is left without a gradient."""
+    policy.train()
+    for parameter in policy.backbone.vision.parameters():
+        parameter.requires_grad_(False)
+    loss, metrics = policy(random_batch(policy))
+    loss.backward()
+    unread = [name for name, p in policy.named_parameters() if p.requires_grad and p.grad is None]
+    assert unread == []
+    assert torch.isfinite(metrics["loss"])
+
+
+def test_gradient_checkpointing_changes_nothing(remembering):
+    losses = []
+    for checkpointing in (False, True):
+        remembering.backbone.transformer.gradient_checkpointing = checkpointing
+        remembering.zero_grad()
+        batch = random_batch(remembering)
+        noise = torch.zeros_like(batch.actions)
+        loss, _ = remembering(batch, noise, torch.full((2,), 0.5))
+        loss.backward()
+        gradient = remembering.memory.encoder.project.weight.grad
+        losses.append((loss.item(), gradient.clone()))
+    assert losses[0][0] == pytest.approx(losses[1][0], abs=1e-6)
+    assert torch.allclose(losses[0][1], losses[1][1], atol=1e-6)
+
+
+def test_modulator_encodes_memory_once_per_chunk():
+    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
+    calls = {"memory": 0, "keys": 0, "recall": 0}
+    layer = policy.integration.layers[0]
+    policy.memory.register_forward_hook(lambda *_: calls.update(memory=calls["memory"] + 1))
+    layer.kv.register_forward_hook(lambda *_: calls.update(keys=calls["keys"] + 1))
+    layer.q.register_forward_hook(lambda *_: calls.update(recall=calls["recall"] + 1))
+    policy.sample_actions(random_batch(policy), steps=10)
+    assert calls == {"memory": 1, "keys": 1, "recall": 10}
+
+
+def test_vision_and_language_run_once_per_chunk(policy):
+    calls = {"vision": 0, "action": 0}
+    policy.backbone.vision.register_forward_hook(lambda *_: calls.update(vision=calls["vision"] + 1))
+    policy.backbone.action_out.register_forward_pre_hook(lambda *_: None)
+    policy.backbone.transformer.register_forward_hook(lambda *_: calls.update(action=calls["action"] + 1))
+    policy.sample_actions(random_batch(policy), steps=10)
+    assert calls == {"vision": 1, "action": 1 + 10}
+
+
+def test_exact_identity_modulator_is_the_memoryless_policy_to_the_bit():
+    memoryless, modulated = (
+        small_policy("pi05", backbone=FEW_TOKENS),
+        small_policy("framesamp_modul", backbone=FEW_TOKENS, integration={"exact_identity": "true"}),
+    )
+    shared = memoryless.state_dict()
+    assert not modulated.load_state_dict(shared, strict=False).unexpected_keys
+    batch = random_batch(memoryless)
+    before = velocity(memoryless, batch)
+    batch.history = random_history(modulated, 2, 100)
+    assert torch.equal(velocity(modulated, batch), before)
+
+
+def test_released_modulator_starts_near_the_memoryless_policy():
+    memoryless, modulated = (
+        small_policy("pi05", backbone=FEW_TOKENS),
+        small_policy("framesamp_modul", backbone=FEW_TOKENS),
+    )
+    modulated.load_state_dict(memoryless.state_dict(), strict=False)
+    batch = random_batch(memoryless)
+    before = velocity(memoryless, batch)
+    batch.history = random_history(modulated, 2, 100)
+    distance = (velocity(modulated, batch) - before).norm() / before.norm()
+    assert 0 < distance < 0.05
+
+
+def prefill(policy, batch):
+    """Keys and values of the prefix, and what the memory injects."""
+    memory = policy.encode_memory(batch.history)
+    injection = policy.inject(policy.prepare_images(batch), memory)
+    return policy.backbone.prefill(injection), injection
+
+
+@torch.no_grad()
+def prefix_keys(policy, batch):
+    """Last-layer keys of the valid image and prompt tokens."""
+    prefix, _ = prefill(policy, batch)
+    after_memory = slice(policy.memory.budget, None)
+    return prefix.layers[-1][0][:, after_memory][prefix.mask[:, after_memory]]
+
+
+@pytest.mark.parametrize("integration", ["context", "expert"])
+def test_prompt_sees_memory_only_if_requested(integration):
+    for sees in (True, False):
+        setting = {"prompt_sees_memory": str(sees).lower()}
+        policy = small_policy(f"framesamp_{integration}", backbone=FEW_TOKENS, memory=MEMORY, integration=setting)
+        row = policy.integration.visibility["prompt"]
+        assert ("memory" in row) is sees
+        batch = random_batch(policy)
+        before = prefix_keys(policy, batch)
+        batch.history.features += 3.0
+        unmoved = torch.allclose(before, prefix_keys(policy, batch), atol=TOLERANCE)
+        assert unmoved is not sees
+
+
+@pytest.mark.parametrize("budget", [64, 512, 2048])
+@pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt"])
+def test_budget_is_a_number_in_the_config(memory, budget):
+    policy = small_policy(f"{memory}_context", backbone=FEW_TOKENS, memory={"budget": budget})
+    batch = random_batch(policy, batch=1, valid=64)
+    tokens = policy.encode_memory(batch.history)
+    assert tokens.tokens.shape[1] == tokens.mask.shape[1] == budget
+    assert velocity(policy, batch).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("memory", "budget"), [("framesamp", 500), ("tokendrop", 63), ("tokendrop", 4096), ("ttt", 4097), ("rmt", 0)]
+)
+def test_an_impossible_budget_is_refused(memory, budget):
+    with pytest.raises(UserError, match=f"memory.budget={budget}"):
+        build_policy(f"{memory}_context", memory={"budget": budget})
+
+
+def test_unknown_names_are_answered_with_the_near_ones():
+    with pytest.raises(UserError, match="tokendrop_expert"):
+        build_policy("tokendrp_expert")
+    with pytest.raises(UserError, match="budget"):
+        build_policy("framesamp_context", memory={"bugdet": 256})
+
+
+def test_bfloat16_compute_stays_close_to_float32(remembering):
+    batch = random_batch(remembering)
+    exact = velocity(remembering, batch)
+    remembering.compute_dtype = torch.bfloat16
+    rounded = velocity(remembering, batch)
+    assert rounded.dtype == torch.float32
+    assert (rounded - exact).norm() / exact.norm() < 0.05
+    assert all(p.dtype == torch.float32 for p in remembering.parameters())
+
+
+def test_sampling_is_reproducible_and_follows_its_noise(policy):
+    batch = random_batch(policy)
+    first = policy.sample_actions(batch, generator=torch.Generator().manual_seed(3))
+    again = policy.sample_actions(batch, generator=torch.Generator().manual_seed(3))
+    other = policy.sample_actions(batch, generator=torch.Generator().manual_seed(4))
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other)
+
+
+def test_checkpoint_round_trip_keeps_every_number(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    loaded = MMEPolicy.from_pretrained(tmp_path)
+    for name, tensor in policy.state_dict().items():
+        assert torch.equal(tensor, loaded.state_dict()[name]), name
+    batch = random_batch(policy)
+    assert torch.equal(velocity(policy, batch), velocity(loaded, batch))
+
+
+def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
+    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
+    with pytest.raises(UserError, match=r"config\.json"):
+        MMEPolicy.from_pretrained(tmp_path / "nowhere")
+    policy.save_pretrained(tmp_path / "damaged")
+    weights = tmp_path / "damaged" / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(UserError, match="damaged"):
+        MMEPolicy.from_pretrained(tmp_path / "damaged")
+    other = small_policy("tokendrop_expert", backbone=FEW_TOKENS)
+    other.save_pretrained(tmp_path / "other")
+    (tmp_path / "other" / "config.json").write_text((tmp_path / "damaged" / "config.json").read_text())
+    (tmp_path / "other" / SUMS).unlink()
+    with pytest.raises(UserError, match=r"(?s)missing.*unexpected"):
+        MMEPolicy.from_pretrained(tmp_path / "other")
+
+
+def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
+    policy = small_policy("pi05", backbone=FEW_TOKENS)
+    batch = random_batch(policy, batch=4)
+    batch.action_mask = torch.arange(batch.actions.shape[1]).expand(4, -1) < torch.tensor([[1], [20], [7], [20]])
+    noise, time_ = torch.randn(batch.actions.shape), torch.full((4,), 0.5)
+    with torch.no_grad():
+        together, _ = policy(batch, noise, time_)
+        halves = [
+            policy(batch._map(lambda x, rows=rows: x[rows]), noise[rows], time_[rows])[0]
+            for rows in (slice(0, 2), slice(2, 4))
+        ]
+        changed = batch.actions.clone()
+        changed[0, 1:] += 9.0
+        batch.actions = changed
+        unchanged, _ = policy(batch, noise, time_)
+    assert together.item() == pytest.approx(sum(h.item() for h in halves) / 2, abs=1e-5)
+    assert torch.isfinite(unchanged)
+
+
+@pytest.mark.parametrize(
+    ("memory", "options", "message"),
+    [
+        ("framesamp", {"grid": 5, "budget": 500}, "memory.grid=5"),
+        ("tokendrop", {"grid": 0}, "memory.grid=0"),
+        ("tokendrop", {"stride": 0}, "memory.stride=0"),
+        ("framesamp", {"pooling": "median"}, "memory.pooling='median'"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused_while_building(memory, options, message):
+    with pytest.raises(UserError, match=message):
+        build_policy(f"{memory}_context", memory=options)
+
+
+def test_a_backbone_of_no_size_is_refused():
+    with pytest.raises(UserError, match="num_heads=0"):
+        build_policy("pi05", backbone={"num_heads": 0})

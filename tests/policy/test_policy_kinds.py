@@ -1,0 +1,140 @@
+"""Policies of any kind: names in a configuration, recipes beyond the released one, statistics with extremes."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from torch import nn
+
+from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
+from mme_vla.config.composition import compose
+from mme_vla.policy.saving import composition_digest, policy_class, policy_options
+from mme_vla.processing.normalise import QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.training.optim import EMA, make_optimizer, scheduled_rate
+from mme_vla.training.runs import _completed, differing_keys
+from mme_vla.training.settings import TrainSettings
+
+
+def settings(**values: Any) -> TrainSettings:
+    return TrainSettings(**{"steps": 100, "batch_size": 1, "lr": 1.0, "warmup": 10, **values})
+
+
+@register("policy", "quiet")
+class QuietPolicy(MMEPolicy):
+    """A kind of policy of one's own."""
+
+
+def test_the_section_policy_says_which_class_is_built() -> None:
+    built = build_policy("pi05", policy={"name": "quiet"})
+    assert type(built) is QuietPolicy and built.config["name"].startswith("quiet")
+    assert type(build_policy("pi05")) is MMEPolicy
+    assert policy_class({}) is policy_class({"policy": {"compute_dtype": "float32"}}) is MMEPolicy
+    for name in ("dreaming", 5, None):
+        with pytest.raises(UserError, match="Unknown policy"):
+            policy_class({"policy": {"name": name}})
+
+
+@register("policy", "keeping")
+class KeepingPolicy(MMEPolicy):
+    """A kind of policy with an option of its own beside those of its parent."""
+
+    def __init__(self, *parts: Any, keep: int = 1, **options: Any) -> None:
+        super().__init__(*parts, **options)
+        self.keep = keep
+
+
+def test_a_subclass_takes_the_options_of_its_parents() -> None:
+    custom = build_policy("pi05", policy={"name": "keeping", "augment": False})
+    assert isinstance(custom, KeepingPolicy) and (custom.augment, custom.keep) == (False, 1)
+    with pytest.raises(UserError, match=r"policy has no key 'augmnt'\. Did you mean 'augment'"):
+        policy_options(KeepingPolicy, {"policy": {"augmnt": False}})
+    assert policy_options(KeepingPolicy, {"policy": {"keep": 3, "augment": False}}) == {"keep": 3, "augment": False}
+
+
+def test_a_kind_comes_back_as_what_it_was(tmp_path: Any) -> None:
+    build_policy("pi05", policy={"name": "quiet"}).save_pretrained(tmp_path)
+    assert type(Policy.from_pretrained(tmp_path)) is type(MMEPolicy.from_pretrained(tmp_path)) is QuietPolicy
+
+
+def test_the_default_kind_changes_no_digest_and_another_does() -> None:
+    config = {"backbone": {"name": "pi05"}, "memory": None}
+    named = {**config, "policy": {"name": "mme", "compute_dtype": "float32"}}
+    assert composition_digest(config) == composition_digest(named)
+    assert composition_digest(config) != composition_digest({**config, "policy": {"name": "quiet"}})
+
+
+def test_rates_of_every_schedule() -> None:
+    assert [scheduled_rate(step, settings()) for step in (0, 10, 99)] == [pytest.approx(1 / 11), 1, 1]
+    from_zero = settings(warmup_from_zero=True, schedule="cosine", schedule_steps=110)
+    rates = [scheduled_rate(step, from_zero) for step in (0, 5, 10, 60, 110, 200)]
+    assert rates == pytest.approx([0, 0.5, 1, 0.5, 0, 0])
+    steps = settings(schedule="steps", milestones=(20, 40), gamma=0.5)
+    assert [scheduled_rate(step, steps) for step in (19, 20, 39, 40)] == [1, 0.5, 0.5, 0.25]
+
+
+def test_parameters_of_few_dimensions_are_not_decayed() -> None:
+    module = nn.Linear(3, 2)
+    with torch.no_grad():
+        module.bias.fill_(1)
+    optimizer = make_optimizer(module.parameters(), settings(decay_min_dim=2, weight_decay=0.5, lr=0.1))
+    before = module.weight.detach().clone()
+    for parameter in module.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    assert torch.allclose(module.weight, before * (1 - 0.05))
+    assert torch.equal(module.bias, torch.ones(2))
+
+
+def test_an_average_that_warms_up_begins_as_a_copy() -> None:
+    module = nn.Linear(1, 1, bias=False)
+    ema = EMA(dict(module.named_parameters()), 0.5, warmup=True)
+    with torch.no_grad():
+        module.weight.fill_(4.0)
+    ema.update(0)
+    assert ema.tensors()["weight"].item() == 4.0
+    assert [ema.decay_after(k) for k in (0, 1, 8, 100)] == [0, pytest.approx(2 / 11), 0.5, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"schedule": "linear"}, "train.schedule='linear' must be constant or cosine or steps"),
+        ({"schedule_steps": 5}, "train.schedule_steps=5 must be no fewer than train.warmup=10"),
+        ({"milestones": (30, 20)}, "ascending order"),
+        ({"gamma": 0}, "train.gamma=0"),
+    ],
+)
+def test_recipes_that_cannot_be(values: dict[str, Any], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        settings(**values)
+
+
+def test_runs_of_before_resume_though_they_know_none_of_the_new_keys() -> None:
+    now: Any = OmegaConf.to_container(compose("train", ["model=pi05"]), resolve=True)
+    config = {key: now[key] for key in ("train", "policy", "backbone", "embodiment")}
+    new = ("warmup_from_zero", "schedule", "schedule_steps", "milestones", "gamma", "decay_min_dim", "ema_warmup")
+    then = {
+        **config,
+        "train": {key: value for key, value in config["train"].items() if key not in new},
+        "policy": {key: value for key, value in config["policy"].items() if key != "name"},
+    }
+    assert set(new) <= set(config["train"])
+    assert differing_keys(_completed(then), _completed(config)) == {}
+    changed = {**config, "train": {**config["train"], "schedule": "cosine"}}
+    assert differing_keys(_completed(then), _completed(changed)) == {"train.schedule": ("constant", "cosine")}
+
+
+def test_normalisation_by_extremes_and_back() -> None:
+    rows = np.random.default_rng(0).normal(size=(500, 3))
+    running = RunningStats()
+    running.update(rows)
+    stats = QuantileStats.from_dict(running.result(extremes=True).to_dict())
+    x = torch.from_numpy(rows).float()
+    scaled = normalize(x, stats, "extremes")
+    assert scaled.amin() >= -1 and scaled.amax() <= 1 and scaled.amax() > 0.99
+    assert torch.allclose(unnormalize(scaled, stats, "extremes"), x, atol=1e-5)
+    assert "min" not in running.result().to_dict(), "the usual file is as it was"
+    with pytest.raises(UserError, match="smallest and largest"):
+        normalize(x, running.result(), "extremes")

@@ -1,0 +1,224 @@
+"""Who holds a place: hundreds of clients that never say goodbye, untrusted sources without the key, and the silent."""
+
+import gc
+import re
+import socket
+import threading
+import time
+import warnings
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, observation, serving_policy, states
+from mme_vla.errors import UserError
+from mme_vla.serving import Limits, ServeSettings, connections, pack, unpack
+
+PICTURE = np.zeros((16, 16, 3), np.uint8)
+EPISODES, LIVE, PLACES = 800, 16, 64
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return serving_policy()
+
+
+def released_episode(address: str, seed: int) -> tuple[object, np.ndarray]:
+    """One episode as the released evaluation script runs it: a connection of its own, which it never closes."""
+    raw = connect(address, compression=None, max_size=None, ping_interval=None)  # pings come after 20 s: not here
+    unpack(raw.recv())
+    chunks = []
+    state = states(1, seed)
+    for message in (
+        {"reset": True},
+        {"add_buffer": True, "images": PICTURE[None, None], "state": state, "exec_start_idx": 0},
+        observation(PICTURE, PICTURE, state[0], reset=False, add_buffer=False),
+    ):
+        raw.send(pack(message))
+        reply = raw.recv()
+        assert isinstance(reply, bytes), reply
+        chunks.append(unpack(reply).get("actions"))
+    return raw, np.stack([chunk for chunk in chunks if chunk is not None])
+
+
+def test_a_full_evaluation_whose_connections_are_never_closed(monkeypatch):
+    policy = serving_policy("pi05")
+    born: list[weakref.ref] = []
+    start = policy.start_episode
+
+    def watched(*args, **options):
+        episode = start(*args, **options)
+        born.append(weakref.ref(episode))
+        return episode
+
+    def predict(episodes, _):  # which episode was asked, and how many frames it remembers
+        return np.stack([np.full((20, 8), episode.state[0] + episode.n_observed_frames) for episode in episodes])
+
+    monkeypatch.setattr(policy, "start_episode", watched)
+    monkeypatch.setattr(policy, "act", predict)
+    with Served(policy, limits=Limits(connections=PLACES)) as served:
+        address = f"ws://127.0.0.1:{served.server.port}"
+        with ThreadPoolExecutor(LIVE) as pool:
+            results = list(pool.map(lambda seed: released_episode(address, seed), range(EPISODES)))
+        for seed, (_, chunks) in enumerate(results):
+            expected = states(1, seed)[0, 0] + 1
+            np.testing.assert_allclose(chunks[0, 0, 0], expected, rtol=1e-5, err_msg=f"episode {seed}")
+        counts = served.server.stats.counts
+        assert (counts["infer"], counts["refused"], counts["failed"]) == (EPISODES, 0, 0)
+        assert counts["let_go"] == EPISODES - PLACES
+        gc.collect()
+        assert sum(ref() is not None for ref in born) <= PLACES
+
+
+def test_a_websocket_that_is_closed_gets_the_reason(policy):
+    with Served(policy, limits=Limits(connections=2)) as served:
+        silent, other, newcomer = served.client(), served.client(), None
+        other.reset()
+        newcomer = served.client()
+        with pytest.raises(ConnectionError, match=r"1001.*full"):
+            silent.reset()
+        assert other.reset() and newcomer.reset()
+        silent.reconnect()
+        assert silent.reset()
+
+
+def test_a_silent_websocket_is_closed_and_its_episode_freed(policy):
+    with Served(policy, limits=Limits(idle_s=4)) as served:
+        client, steady = served.client(), served.client()
+        client.infer(challenge(*course()[0], first=True))
+        until = time.monotonic() + 30
+        while served.server.stats.connections > 1 and time.monotonic() < until:
+            steady.reset()
+            time.sleep(0.05)
+        assert served.server.stats.connections == 1
+        with pytest.raises(ConnectionError, match=r"1001.*silent"):
+            client.reset()
+        assert steady.reset()
+
+
+def idle(served: Served, count: int, request: bytes) -> list[socket.socket]:
+    sockets = []
+    for _ in range(count):
+        raw = socket.create_connection(served.address, timeout=10)
+        if request:
+            raw.sendall(request)
+            raw.recv(4096)
+        sockets.append(raw)
+    return sockets
+
+
+@pytest.mark.parametrize("request_", [b"", b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n",
+                                      b"GET /stats HTTP/1.1\r\nHost: x\r\n\r\n"])  # fmt: skip
+def test_unauthenticated_clients_take_no_place_from_those_who_have_the_key(policy, request_):
+    with Served(policy, api_key="right", limits=Limits(connections=2)) as served:
+        known = served.client(api_key="right")
+        sockets = idle(served, connections.MAX_UNAUTHENTICATED + 20, request_)
+        with served.client(api_key="right") as client:
+            assert client.reset() and known.reset()
+            assert ask(served, "GET", "/healthz")[0] == 200
+        assert len(served.server.connections.open) <= connections.MAX_UNAUTHENTICATED + 3
+        for raw in sockets:
+            raw.close()
+
+
+def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
+    monkeypatch.setattr(connections, "HEAD_S", 0.5)
+    with Served(policy, limits=Limits(receive_s=1)) as served:
+        sockets = idle(served, 1, b"")
+        sockets += idle(served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")  # answered, and then it dawdles
+        until = time.monotonic() + 30
+        while time.monotonic() < until and served.server.connections.open:
+            for raw in sockets:
+                with suppress(OSError):
+                    raw.sendall(b"G")
+            time.sleep(0.1)
+        assert not served.server.connections.open
+
+
+def resident_mib() -> float:
+    match = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert match
+    return int(match[1]) / 1024
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads memory from /proc")
+@pytest.mark.parametrize("path", ["/healthz", "/metadata", "/infer"])
+def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
+    monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.5)
+    piece = bytes(2**20)
+    with Served(policy, api_key="right") as served:
+        before = resident_mib()
+        with socket.create_connection(served.address, timeout=10) as raw:
+            raw.sendall(f"GET {path} HTTP/1.1\r\nHost: x\r\nContent-Length: {2**30}\r\n\r\n".encode())
+            with pytest.raises(OSError):
+                for _ in range(400):
+                    raw.sendall(piece)
+                    time.sleep(0.01)
+        assert resident_mib() - before < 100
+        assert ask(served, "GET", "/healthz")[0] == 200
+
+
+def test_a_lost_http_episode_is_not_gone_on_with(policy):
+    first, later = (pack(challenge(*part, first=index == 0)) for index, part in enumerate(course()[:2]))
+    buffer = pack({"add_buffer": True, "images": PICTURE[None, None], "state": states(1)})
+    with Served(policy, limits=Limits(connections=2)) as served:
+        assert ask(served, "POST", "/infer", buffer, X_Session="a")[0] == 409, "it was never begun"
+        assert ask(served, "POST", "/infer", first, X_Session="a")[0] == 200
+        for other in "bc":  # two others come, and the first has to go
+            assert ask(served, "POST", "/infer", first, X_Session=other)[0] == 200
+        for lost in (later, buffer):
+            status, _, reply = ask(served, "POST", "/infer", lost, X_Session="a")
+            assert status == 409 and b"Reset and begin the episode again" in reply
+        assert ask(served, "POST", "/infer", later, X_Session="c")[0] == 200
+        assert ask(served, "POST", "/infer", b"garbage", X_Session="c")[0] == 400
+        assert ask(served, "POST", "/infer", later, X_Session="c")[0] == 409
+        assert ask(served, "POST", "/infer", first, X_Session="c")[0] == 200
+
+
+def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeypatch):
+    parts = course()
+    expected = acted_directly(policy, parts)[0][:16]
+    act = policy.act
+
+    def brittle(episodes, steps):
+        if any(episode.goal == "break" for episode in episodes):
+            for episode in episodes:
+                episode.draw()  # as far as the policy got
+            raise ValueError("broken")
+        return act(episodes, steps)
+
+    monkeypatch.setattr(policy, "act", brittle)
+    message = challenge(*parts[0], first=True)
+    with Served(policy) as served:
+        together = threading.Barrier(4)
+
+        def run(number: int) -> np.ndarray | str:
+            with served.client() as client:
+                together.wait()
+                try:
+                    return client.infer({**message, **({"task_goal": "break"} if number == 0 else {})})["actions"]
+                except UserError as error:
+                    return str(error)
+
+        with ThreadPoolExecutor(4) as pool:
+            failure, *chunks = pool.map(run, range(4))
+    assert "broken" in failure
+    for chunk in chunks:
+        np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_an_empty_key_is_none():
+    assert ServeSettings.from_dict({"api_key": ""}).api_key is None
+    assert ServeSettings.from_dict({"api_key": "right"}).api_key == "right"
+
+
+def test_the_client_uses_nothing_that_is_about_to_go(policy):
+    with Served(policy) as served, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with served.client() as client:
+            assert client.reset()["reset_finished"] is True

@@ -1,0 +1,110 @@
+"""The prompted model where things are not as they should be: settings, answers, kept files, interrupts."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from helpers import REPOSITORY
+from helpers.subgoal_fakes import frames, kinds, play, predictor_of, says, started
+from mme_vla.errors import UserError
+from mme_vla.subgoal.models.api import side_by_side
+
+
+def test_late_tasks_leave_out_what_came_due_before_their_step():
+    predictor, _ = predictor_of(*[says("wait")] * 4)
+    episode, queries = started(predictor, "BinFill"), []
+    for _ in range(7):
+        queries += [episode.step] if predictor.predict([episode])[0].queried else []
+        episode.observe(frames(20, episode.n_observed_frames))
+    assert queries == [0, 100], "the question of step 48 is left out, the one of step 96 is asked at 100"
+
+
+def test_a_point_that_cannot_be_read_is_counted_and_survived():
+    predictor, _ = predictor_of(says("press"), says(f"move to <{'9' * 5000}, 3>"))
+    subgoals, _ = play(predictor, started(predictor), 4)
+    assert (subgoals[3].text, subgoals[3].problem) == ("press", "malformed")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("timeout", 0), ("timeout", "soon"), ("retries", -1), ("retries", 1.5), ("backoff", -1), ("temperature", -0.1),
+     ("requests_per_minute", 0), ("input_price", -1), ("output_price", float("nan")), ("workers", 0), ("wait", -1)],
+)  # fmt: skip
+def test_settings_that_cannot_work_are_named(key, value):
+    with pytest.raises(UserError, match=f"{key}="):
+        predictor_of(**{key: value})
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[]", '{"text": "a"}', '{"text": "a", "input_tokens": "x"}'])
+def test_a_damaged_reply_on_disk_is_requested_again(damage, tmp_path):
+    first, _ = predictor_of(says("press"), cache=str(tmp_path))
+    first.predict([started(first)])
+    (cached,) = tmp_path.rglob("*.json")
+    content = cached.read_text()
+    cached.write_text(damage)
+    again, client = predictor_of(says("press"), cache=str(tmp_path))
+    assert again.predict([started(again)])[0].text == "press"
+    assert len(client.requests) == 1 and again.usage.cached == 0 and cached.read_text() == content
+    assert [path.suffix for path in tmp_path.rglob("*.*")] == [".json"]
+
+
+def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
+    encoded = []
+
+    def count(pixels, **options):
+        encoded.append(pixels.shape)
+        return b"clip"
+
+    monkeypatch.setattr("mme_vla.subgoal.models.connection.video_bytes", count)
+    predictor, client = predictor_of(*[says("a")] * 4)
+    play(predictor, started(predictor, video=10), 10)
+    assert len(client.requests) == 4 and [shape[0] for shape in encoded] == [10, 48, 48, 48]
+    last = client.requests[-1][0]
+    assert [message["role"] for message in last] == ["user", "model"] * 3 + ["user"]
+    assert kinds(last[2]["parts"]) == kinds(last[4]["parts"]) == ["video/mp4", "text"]
+
+
+@pytest.mark.slow
+def test_an_interrupt_does_not_wait_for_answers_under_way():
+    code = """
+import signal, threading, time
+import numpy as np
+from mme_vla.subgoal import BackgroundPredictor, Gemini
+
+class Client:
+    def generate_content(self, **_):
+        time.sleep(60)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the parent did with it
+main = threading.main_thread().ident
+client = Client()
+client.models = client
+gemini = Gemini(client=client)
+for predictor in (gemini, BackgroundPredictor(gemini)):
+    episode = predictor.start_episode("goal")
+    episode.observe(np.zeros((1, 8, 8, 3), np.uint8))
+    threading.Timer(0.3, signal.pthread_kill, (main, signal.SIGINT)).start()
+    began = time.monotonic()
+    try:
+        predictor.predict([episode])
+    except KeyboardInterrupt:
+        print("interrupted", time.monotonic() - began < 5)
+"""
+    began = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY, timeout=50)
+    assert done.stdout.split() == ["interrupted", "True"] * 2 and done.returncode == 0, done.stderr
+    assert time.monotonic() - began < 40
+
+
+def test_after_a_fatal_failure_no_further_question_goes_out():
+    begun = []
+
+    def call(item):
+        begun.append(item)
+        raise UserError("no such key")
+
+    with pytest.raises(UserError, match="no such key"):
+        side_by_side(call, range(50), 1)
+    assert begun == [0]

@@ -1,0 +1,201 @@
+"""Prompted models behind any endpoint that speaks OpenAI's chat completions, against a server on this machine."""
+
+import base64
+import io
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from helpers.chat_server import ChatServer, chat_server, failure, says
+from mme_vla.errors import UserError
+from mme_vla.play import OpenAIPlayer
+from mme_vla.subgoal import OpenAI, build_predictor
+from mme_vla.subgoal.models.connection import OpenAISettings
+
+pytest.importorskip("openai", reason="needs the extra openai")
+SECRET = "sk-not-a-real-key"
+QUICK = {"backoff": 0, "requests_per_minute": None}
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[ChatServer]:
+    monkeypatch.setenv("OPENAI_API_KEY", SECRET)
+    with chat_server() as found:
+        yield found
+
+
+def frames(count: int, first: int = 0) -> np.ndarray:
+    return np.stack([np.full((32, 32, 3), (first + t) % 256, np.uint8) for t in range(count)])
+
+
+def subgoal(text: str) -> tuple[int, dict[str, Any]]:
+    return says(f'{{"description": "x", "subgoal": "{text}"}}')
+
+
+def test_a_conversation_over_http(server: ChatServer, caplog: pytest.LogCaptureFixture) -> None:
+    server.answers = [
+        failure(503, "overloaded"),
+        subgoal("press the button at <500, 250>"),
+        says(None, finish="content_filter"),
+        failure(500, f"internal, key={SECRET}"),
+        failure(429, "slowly"),
+        subgoal("put it down"),
+    ]
+    predictor = OpenAI(base_url=server.url, retries=1, interval=16, input_price=1.0, output_price=2.0, **QUICK)
+    episode = predictor.start_episode("press", frames(30), "StopCube")
+    episode.observe(frames(1))
+    subgoals = []
+    with caplog.at_level(logging.DEBUG):
+        for _ in range(4):
+            subgoals.append(predictor.predict([episode])[0])
+            episode.observe(frames(16))
+    assert [s.problem for s in subgoals] == ["", "refused", "failed", ""]
+    assert [s.text for s in subgoals] == ["press the button at <128, 64>"] * 3 + ["put it down"]
+    usage = predictor.usage
+    assert (usage.calls, usage.retries, usage.input_tokens, usage.output_tokens) == (3, 2, 900, 300)
+    assert usage.cost == pytest.approx((900 * 1.0 + 300 * 2.0) / 1e6)
+    assert set(server.keys) == {f"Bearer {SECRET}"} and SECRET not in caplog.text
+    system, *messages = server.requests[-1]["messages"]
+    assert system["role"] == "system" and "subgoal" in system["content"]
+    assert [turn["role"] for turn in messages] == ["user", "assistant", "user"]
+    assert isinstance(messages[1]["content"], str), "a model's own words go back as a text"
+    assert "temperature" not in server.requests[0]
+
+
+def test_a_video_is_sent_as_sampled_images(server: ChatServer) -> None:
+    server.answers = [subgoal("press")]
+    predictor = OpenAI(base_url=server.url, video_frames=4, temperature=0.0, **QUICK)
+    episode = predictor.start_episode("press", frames(31), "StopCube")
+    episode.observe(frames(1, first=200))
+    predictor.predict([episode])
+    content = server.requests[0]["messages"][1]["content"]
+    urls = [part["image_url"]["url"] for part in content if part["type"] == "image_url"]
+    assert "A video of 31 frames; 4 of them in order:" in content[0]["text"]
+    pixels = [np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1])))) for url in urls]
+    assert [int(image[0, 0, 0]) for image in pixels] == [0, 10, 20, 30, 200]
+    assert server.requests[0]["temperature"] == 0.0
+
+
+def test_answers_are_replayed_from_the_cache_without_a_key_or_a_server(
+    server: ChatServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def first_subgoal(**where: Any) -> tuple[str | None, Any]:
+        predictor = OpenAI(cache=str(tmp_path), **where, **QUICK)
+        episode = predictor.start_episode("press", None, "StopCube")
+        episode.observe(frames(1))
+        return predictor.predict([episode])[0].text, predictor
+
+    server.answers = [subgoal("press"), subgoal("another model's")]
+    assert first_subgoal(base_url=server.url)[0] == "press"
+    monkeypatch.delenv("OPENAI_API_KEY")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "openai", None)
+        text, predictor = first_subgoal()
+    assert (text, predictor.usage.cached, predictor.usage.calls) == ("press", 1, 0)
+    with pytest.raises(UserError, match=r"key in the environment variable OPENAI_API_KEY.*lacks this answer"):
+        first_subgoal(model="another")
+    monkeypatch.setenv("OPENAI_API_KEY", SECRET)
+    assert first_subgoal(base_url=server.url, model="another")[0] == "another model's"
+
+
+def test_an_endpoint_without_a_key_gets_none(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENAI_API_KEY")
+    server.answers = [subgoal("press")]
+    config = {"name": "openai", "base_url": server.url, "key_variable": None, **QUICK}
+    predictor = build_predictor(config)
+    assert isinstance(predictor, OpenAI)
+    episode = predictor.start_episode("press")
+    episode.observe(frames(1))
+    assert predictor.predict([episode])[0].text == "press" and server.keys == ["Bearer none"]
+    with pytest.raises(UserError, match="key_variable=null"):
+        OpenAI(base_url=server.url)
+
+
+def test_a_wrong_key_or_model_ends_the_run_at_once(server: ChatServer) -> None:
+    for code in (401, 404):
+        server.answers = [failure(code, f"not yours: {SECRET}")]
+        predictor = OpenAI(base_url=server.url, **QUICK)
+        episode = predictor.start_episode("press")
+        episode.observe(frames(1))
+        with pytest.raises(UserError, match="OPENAI_API_KEY") as caught:
+            predictor.predict([episode])
+        assert SECRET not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"base_url": "127.0.0.1:80"}, "must be an address"),
+        ({"video_frames": 3}, "an even number"),
+        ({"video_frames": True}, "a whole number, 2 or more"),
+        ({"temperature": -1}, "a number, 0 or more or null"),
+    ],
+)
+def test_impossible_settings_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        OpenAI(**settings)
+
+
+def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", SECRET)
+    monkeypatch.setitem(sys.modules, "openai", None)
+    with pytest.raises(UserError, match="extra `openai`"):
+        OpenAI()
+
+
+def test_a_player_speaks_to_the_same_endpoints(server: ChatServer) -> None:
+    options = (SimpleNamespace(label="a", action="press", needs_point=True),)
+    image = np.zeros((256, 256, 3), np.uint8)
+    session: Any = SimpleNamespace(
+        goal="press", options=options, decisions=[], frame=image, reveals=[SimpleNamespace(frames=[image] * 6)]
+    )
+    server.answers = [says("I see it."), says('{"choice": "a", "point": [500, 250]}')]
+    player = OpenAIPlayer(base_url=server.url, **QUICK)
+    player.start(session)
+    action, note = player.choose(session)
+    assert action == {"choice": "a", "point": [128, 64]} and note["answers"][0] == "I see it."
+    assert (player.model, player.notes()["usage"]["calls"]) == ("gpt-5-mini", 2)
+
+
+def test_an_answer_that_repeats_the_key_is_kept_without_it(
+    server: ChatServer, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    login = base64.b64encode(b"me:pa@ssword-1").decode()
+    address = server.url.replace("//", "//me:pa%40ssword-1@")
+    echo = f"{SECRET} pa@ssword-1 {login}"
+    server.answers = [failure(500, echo), says(None, refusal=echo), subgoal(f"press {echo}")]
+    predictor = OpenAI(base_url=address, cache=str(tmp_path), retries=1, interval=16, **QUICK)
+    episode = predictor.start_episode("press", None, "StopCube")
+    heard = []
+    with caplog.at_level(logging.DEBUG):
+        for _ in range(2):
+            episode.observe(frames(16))
+            heard.append(predictor.predict([episode])[0])
+    kept = "".join(file.read_text() for file in tmp_path.rglob("*.json"))
+    for text in (caplog.text, repr(heard), kept):
+        assert not any(secret in text for secret in (SECRET, "ssword", login))
+    assert "press *** *** ***" in heard[1].reply and "press *** *** ***" in kept
+    assert set(server.keys) == {f"Basic {login}"}, "as it is sent for an address with a password"
+
+
+@pytest.mark.parametrize("address", ["ftp://me:secret-word@host", "http://[me:secret-word@host"])
+def test_an_address_that_is_refused_is_named_without_its_password(address: str) -> None:
+    with pytest.raises(UserError, match="must be an address") as caught:
+        OpenAISettings(base_url=address)
+    assert "secret-word" not in str(caught.value)
+
+
+def test_a_key_that_is_a_word_is_left_in_answers(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "none")
+    server.answers = [subgoal("press none of them")]
+    predictor = OpenAI(base_url=server.url, **QUICK)
+    episode = predictor.start_episode("press")
+    episode.observe(frames(1))
+    assert predictor.predict([episode])[0].text == "press none of them"

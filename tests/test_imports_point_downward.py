@@ -1,0 +1,100 @@
+"""Imports of the library point downward: the order of its packages, without exemption, and no cycle at run time."""
+
+import ast
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+from helpers import REPOSITORY
+
+PACKAGE = REPOSITORY / "mme_vla"
+
+# From the top: a package or top-level module imports only itself and what is below it.
+ORDER = [
+    "cli", "nano", "testing", "play", "probing", "evaluation", "serving", "training", "subgoal", "envs", "data",
+    "methods", "weights", "policy", "model", "processing", "integration", "memory", "backbone", "speed", "embodiment",
+    "config", "types", "registry", "utils", "errors",
+]  # fmt: skip
+ENTRIES = {"train", "evaluate", "results", "analyse", "probe", "inspect", "serve", "__main__"}
+"""Top-level modules that only run a command, as `__main__.py` of `nano` and `play` does: they belong to `cli`."""
+APART = ("memory", "backbone")
+"""Packages that do not import each other in either direction."""
+
+
+@cache
+def modules() -> dict[str, Path]:
+    paths = {}
+    for file in PACKAGE.rglob("*.py"):
+        parts = ("mme_vla", *file.relative_to(PACKAGE).with_suffix("").parts)
+        paths[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return paths
+
+
+def level_of(module: str) -> str:
+    """The entry of `ORDER` that a module belongs to; `mme_vla` itself, which loads lazily, is at the top."""
+    parts = module.split(".")
+    return "cli" if parts[-1] == "__main__" or len(parts) == 1 or parts[1] in ENTRIES else parts[1]
+
+
+@cache
+def imports(module: str, for_types: bool = True) -> set[str]:
+    """Modules of the library that a module imports anywhere: at run time, lazily, or for type checkers alone."""
+    tree = ast.parse(modules()[module].read_text())
+    if not for_types:
+        tree.body = [node for node in tree.body if "TYPE_CHECKING" not in ast.unparse(getattr(node, "test", node))[:13]]
+    return set(_imports(tree)) - {module}
+
+
+def _imports(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules())
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                yield from (
+                    target for target in (name, node.module)[name not in modules() :][:1] if target in modules()
+                )
+
+
+def test_every_package_has_a_place_in_the_order() -> None:
+    assert {level_of(module) for module in modules()} <= set(ORDER)
+
+
+def test_imports_point_downward() -> None:
+    upward = [
+        f"{module} imports {target}"
+        for module in modules()
+        for target in imports(module)
+        if ORDER.index(level_of(target)) < ORDER.index(level_of(module))
+    ]
+    assert upward == []
+
+
+def test_no_import_cycles() -> None:
+    """Modules of one package may name each other's classes for type checkers."""
+    done: set[str] = set()
+
+    def visit(module: str, path: tuple[str, ...]) -> None:
+        assert module not in path, "cycle: " + " → ".join([*path[path.index(module) :], module])
+        if module not in done:
+            for target in sorted(imports(module, for_types=False)):
+                visit(target, (*path, module))
+            done.add(module)
+
+    for module in modules():
+        visit(module, ())
+
+
+def test_memory_and_backbone_do_not_import_each_other() -> None:
+    crossing = {f"{module} imports {target}" for module in modules() for target in imports(module)
+                if {level_of(module), level_of(target)} == set(APART)}  # fmt: skip
+    assert crossing == set()
+
+
+def test_the_core_imports_without_transformers() -> None:
+    """Language models that predict subgoals need it, and SAM2's encoder of one method."""
+    for module, file in modules().items():
+        if level_of(module) != "subgoal" and file.parent.name != "sam2act":
+            lines = file.read_text().splitlines()  # methods import it where they build their towers
+            assert not [line for line in lines if line.startswith(("import transformers", "from transformers"))], file

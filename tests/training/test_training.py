@@ -1,0 +1,352 @@
+"""The training loop, its checkpoints and its refusals, on samples made in memory."""
+
+import io
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from accelerate import Accelerator
+from omegaconf import OmegaConf
+
+from helpers.trainings import RECIPE, SMALL, Samples, collate, loggers, policy, trainer
+from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.config.composition import compose
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
+from mme_vla.training.checkpoint import check_disk
+from mme_vla.training.data import check_frozen
+from mme_vla.training.logging import ProgressLine, check_logger, open_loggers, read_metrics
+from mme_vla.training.loop import Trainer, loss_change
+from mme_vla.training.order import Validation
+from mme_vla.training.runs import Run, differing_keys, open_run, start_from
+from mme_vla.training.settings import KeepRule, TrainSettings
+
+
+def train(folder: Path, *args: Any, **kwargs: Any) -> Trainer:
+    built = trainer(folder, *args, **kwargs)
+    with ProgressLine(6, 0, visible=False) as line:
+        assert built.run(line, loggers(built.run_info.folder, built.run_info.step))
+    return built
+
+
+def losses(folder: Path) -> list[float]:
+    return [line["train/loss"] for line in read_metrics(folder) if "train/loss" in line]
+
+
+def test_the_same_seed_trains_the_same_policy(tmp_path: Path) -> None:
+    first, second = train(tmp_path / "a"), train(tmp_path / "b")
+    assert losses(tmp_path / "a") == losses(tmp_path / "b")
+    for name, weight in first.policy.state_dict().items():
+        assert torch.equal(weight, second.policy.state_dict()[name]), name
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, workers: int) -> None:
+    straight = train(tmp_path / "whole", workers=workers)
+    train(tmp_path / "parts", steps=3)
+    checkpoint = resolve_checkpoint(tmp_path / "parts")
+    assert checkpoint.name == "step_000003"
+    resumed = train(tmp_path, built=policy(seed=9), run=Run(tmp_path / "parts", checkpoint, 3), workers=workers)
+    assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
+    for name, weight in straight.policy.state_dict().items():
+        assert torch.equal(weight, resumed.policy.state_dict()[name]), name
+    for name, average in straight.ema.tensors().items():
+        assert torch.equal(average, resumed.ema.tensors()[name]), name
+
+
+def test_computing_a_batch_in_pieces_gives_the_same_update(tmp_path: Path) -> None:
+    built = policy(policy={"augment": False})
+    straight = train(tmp_path / "a", built=built, steps=2, val_every=9)
+    pieces = train(tmp_path / "b", built=policy(policy={"augment": False}), steps=2, val_every=9, accumulate=2)
+    assert losses(tmp_path / "a") == pytest.approx(losses(tmp_path / "b"), rel=1e-5)
+    for name, weight in straight.policy.state_dict().items():
+        torch.testing.assert_close(weight, pieces.policy.state_dict()[name], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context"])
+def test_all_trained_weights_are_updated_and_the_frozen_tower_is_not(tmp_path: Path, name: str) -> None:
+    built = policy(name)
+    before = {key: value.clone() for key, value in built.state_dict().items()}
+    after = train(tmp_path, built=built, gradient_checkpointing=True).policy
+    unchanged = {key for key, value in after.state_dict().items() if torch.equal(value, before[key])}
+    assert unchanged == {key for key in before if key.startswith("backbone.vision.")}
+
+
+def test_from_pretrained_takes_the_averaged_weights(tmp_path: Path) -> None:
+    done = train(tmp_path)
+    loaded = MMEPolicy.from_pretrained(resolve_checkpoint(tmp_path))
+    for name, average in done.ema.tensors().items():
+        assert torch.equal(loaded.state_dict()[name], average)
+    raw = done.policy.backbone.action_in.weight
+    assert not torch.equal(loaded.backbone.action_in.weight, raw)
+
+
+def test_only_the_checkpoints_of_the_rule_stay(tmp_path: Path) -> None:
+    train(tmp_path, save_every=1, keep={"last": 2, "every": 3})
+    assert [path.name for path in checkpoints_in(tmp_path / "checkpoints")] == [
+        "step_000003", "step_000005", "step_000006",
+    ]  # fmt: skip
+    assert not list((tmp_path / "checkpoints").glob(".*"))
+
+
+def test_a_half_saved_checkpoint_is_not_one(tmp_path: Path) -> None:
+    train(tmp_path, steps=2)
+    (tmp_path / "checkpoints" / ".step_000004.partial").mkdir()
+    assert resolve_checkpoint(tmp_path).name == "step_000002"
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_saves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"train/loss .* before step 1"):
+        train(tmp_path, actions=math.nan)
+    assert not (tmp_path / "checkpoints").exists()
+
+
+def test_validation_loss_does_not_depend_on_when_it_is_queried() -> None:
+    built = policy()
+    validation = Validation(Samples(built, 5), collate, 3, 2, seed=1)
+    first = validation.loss(built)
+    torch.manual_seed(5)
+    assert validation.loss(built.train()) == first
+    assert built.training
+    assert validation.indices == [0, 2, 4]
+    assert Validation(Samples(built, 5), collate, 3, 3, seed=1).loss(built) == pytest.approx(first, rel=1e-5)
+
+
+def test_without_a_terminal_progress_is_text_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ProgressLine(6, 0)
+    line.console.file = io.StringIO()
+    with line:
+        trainer(tmp_path, steps=2).run(line, loggers(tmp_path))
+    text = line.console.file.getvalue()
+    assert "step 1/6 · loss" in text
+    assert all(mark in text for mark in ("lr ", "grad ", "samples/s", "GiB"))
+    assert "\x1b" not in text
+    assert "\r" not in text
+
+
+def test_a_folder_that_holds_a_run_is_never_overwritten(tmp_path: Path) -> None:
+    train(tmp_path, steps=2)
+    with pytest.raises(UserError, match="never overwritten"):
+        open_run(tmp_path, None, {})
+
+
+def test_resuming_with_other_settings_lists_them(tmp_path: Path) -> None:
+    train(tmp_path, steps=2)
+    config = {"train": {**RECIPE, "steps": 9, "log_every": 3, "lr": 0.5}, "seed": 2}
+    with pytest.raises(UserError) as error:
+        open_run(tmp_path / "new", str(tmp_path), config)
+    assert "train.lr: 0.01 then, 0.5 now" in str(error.value)
+    assert "seed: 1 then, 2 now" in str(error.value)
+    assert "train.steps" not in str(error.value).replace("train.steps=", "")
+    assert "log_every" not in str(error.value)
+    run = open_run(tmp_path / "new", str(tmp_path), {"train": {**RECIPE, "steps": 9}, "seed": 1})
+    assert (run.folder, run.step) == (tmp_path, 2)
+    with pytest.raises(UserError, match=r"has done 2 steps already, more than train\.steps=1"):
+        open_run(tmp_path / "new", str(tmp_path), {"train": {**RECIPE, "steps": 1}, "seed": 1})
+
+
+def test_a_setting_that_came_or_went_counts_as_changed() -> None:
+    assert differing_keys({"a": {"b": 1}}, {"a": {"c": 1}}) == {"a.b": (1, None), "a.c": (None, 1)}
+    assert differing_keys({"logger": {"name": "wandb"}, "keep": (1, 2)}, {"logger": None, "keep": [1, 2]}) == {}
+
+
+def test_auto_resumes_the_newest_unfinished_run_or_begins(tmp_path: Path) -> None:
+    config = {"train": {**RECIPE, "steps": 9}, "seed": 1}
+    assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
+    train(tmp_path / "a", steps=2)
+    assert open_run(tmp_path / "b", "auto", config).folder == tmp_path / "a"
+    (tmp_path / "a" / "summary.json").write_text("{}")
+    assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
+
+
+def write_unsummed(file: Path, text: str) -> None:
+    (file.parent / "SHA256SUMS").unlink()
+    file.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda folder: (folder / "training_state.json").unlink(), "nothing to resume"),
+        (lambda folder: (folder / "training_state.json").write_text("{"), "damaged"),
+        (lambda folder: write_unsummed(folder / "training_state.json", '{"format": "theirs"}'), "not written by"),
+        (lambda folder: (folder / "optimizer.safetensors").unlink(), "lacks optimizer.safetensors"),
+        (lambda folder: (folder / "raw.safetensors").write_bytes(b"broken"), "raw.safetensors is damaged"),
+        (lambda folder: (folder / "model.safetensors").write_bytes(b"\0" * 64), "damaged"),
+    ],
+)
+def test_broken_checkpoints_are_refused(tmp_path: Path, break_it: Any, message: str) -> None:
+    train(tmp_path, steps=2)
+    folder = resolve_checkpoint(tmp_path)
+    break_it(folder)
+    with pytest.raises(UserError, match=message):
+        run = open_run(tmp_path / "new", str(folder), {"train": {**RECIPE, "steps": 6}, "seed": 1})
+        trainer(tmp_path, run=run)
+
+
+def test_a_checkpoint_of_another_model_does_not_fit(tmp_path: Path) -> None:
+    train(tmp_path, steps=2)
+    with pytest.raises(UserError, match="does not fit this policy"):
+        trainer(tmp_path, built=policy("tokendrop_expert"), run=Run(tmp_path, resolve_checkpoint(tmp_path), 2))
+
+
+def test_a_missing_checkpoint_is_reported_with_its_layout(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="No checkpoint at"):
+        resolve_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("files", [["29999/params/_METADATA"], ["29999/params/_METADATA", "history_config.txt"],
+                                   ["79999.zip"]])  # fmt: skip
+def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tmp_path: Path, files: list[str]) -> None:
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    run, step = tmp_path, tmp_path / files[0].split("/")[0]
+    for place in (run, step):
+        with pytest.raises(UserError, match=rf"mme-vla weights {place} \S+_converted"):
+            resolve_checkpoint(place)
+
+
+@pytest.mark.parametrize("name", ["tokendrop_expert", "framesamp_modul", "tokendrop_context"])
+def test_a_memory_starts_from_the_memoryless_policy(tmp_path: Path, name: str) -> None:
+    base = policy(seed=5)
+    base.save_pretrained(tmp_path)
+    built = policy(name)
+    sentence = start_from(built, str(tmp_path))
+    assert "memory.encoder" in sentence
+    assert all(torch.equal(built.state_dict()[key], value) for key, value in base.state_dict().items())
+
+
+def test_starting_from_a_smaller_policy_is_refused(tmp_path: Path) -> None:
+    build_policy("pi05", backbone={**SMALL, "depth": 2}).save_pretrained(tmp_path / "deeper")
+    wide = build_policy("pi05", backbone={**SMALL, "action_dim": 16})
+    wide.save_pretrained(tmp_path / "narrow")
+    with pytest.raises(UserError, match="misshapen"):
+        start_from(policy(), str(tmp_path / "narrow"))
+    with pytest.raises(UserError, match="missing"):
+        start_from(build_policy("pi05", backbone={**SMALL, "depth": 3}), str(tmp_path / "deeper"))
+
+
+def test_the_tower_under_a_memory_stays_frozen() -> None:
+    check_frozen(policy(), freeze_vision=False)
+    with pytest.raises(UserError, match="freeze_vision"):
+        check_frozen(policy("tokendrop_expert"), freeze_vision=False)
+
+
+def test_too_small_a_disk_is_detected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda path: os.terminal_size((0, 0)) and type("Usage", (), {"free": 10}))
+    with pytest.raises(UserError, match="free"):
+        check_disk(tmp_path / "not" / "there", policy(), KeepRule())
+
+
+def log_twice(folder: Path, section: dict[str, Any]) -> None:
+    """Log as a run that is resumed after its third update."""
+    from PIL import Image
+
+    Accelerator(cpu=True)
+    folder.mkdir(parents=True)
+    Image.new("RGB", (4, 4)).save(folder / "p.png")
+    for step in (3, 4):
+        opened = open_loggers(folder, {"logger": section}, step - 1)
+        opened.write(step, {"train/loss": 0.5})
+        opened.log_image(step, "plot", folder / "p.png")
+        opened.close()
+    assert read_metrics(folder) == [{"step": step, "train/loss": 0.5} for step in (3, 4)]
+
+
+def test_tensorboard_records_numbers_and_images(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log_twice(tmp_path / "run", {"name": "tensorboard"})
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("train/loss")] == [3, 4]
+    assert events.Tags()["images"] == ["plot"]
+
+
+def test_wandb_records_offline_and_a_resumed_run_keeps_its_id(tmp_path: Path) -> None:
+    pytest.importorskip("wandb", reason="uv sync --inexact --extra wandb")
+    folder = tmp_path / "model" / "run"
+    log_twice(folder, {"name": "wandb", "mode": "offline"})
+    run_id = (folder / "wandb_id").read_text()
+    files = list(folder.glob(f"wandb/offline-run-*/run-{run_id}.wandb"))
+    assert len(files) == 2 and all(file.stat().st_size for file in files)
+
+
+def test_trackio_resumes_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
+    trackio = pytest.importorskip("trackio", reason="pip install -c constraints.txt trackio")
+    log_twice(tmp_path / "model" / "run", {"name": "trackio"})
+    (run,) = trackio.Api().runs("mme_vla")
+    assert run.name.startswith("model/run-")
+
+
+def test_mlflow_resumes_its_run(tmp_path: Path) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="pip install -c constraints.txt mlflow")
+    folder = tmp_path / "model" / "run"
+    log_twice(folder, {"name": "mlflow"})
+    run_id = (folder / "mlflow_id").read_text()
+    history = mlflow.MlflowClient().get_metric_history(run_id, "train/loss")
+    assert [point.step for point in history] == [3, 4]
+    assert list((folder / "mlflow").rglob("p.png"))
+
+
+def test_metrics_beyond_the_resumed_step_are_cut_off(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
+    with pytest.warns(UserWarning, match="half-written"):
+        open_loggers(tmp_path, {}, 1).close()
+    assert read_metrics(tmp_path) == [{"step": 1}]
+
+
+@pytest.mark.parametrize("name", ["wandb", "trackio", "mlflow"])
+def test_missing_logger_package_is_reported(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setitem(__import__("sys").modules, name, None)
+    with pytest.raises(UserError, match=f"logger={name} needs the .* `?{name}"):
+        check_logger({"logger": {"name": name}})
+
+
+def test_unknown_logger_names_the_nearest(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"Unknown logger 'tensorbord'.*tensorboard"):
+        open_loggers(tmp_path, {"logger": {"name": "tensorbord"}}, 0)
+
+
+def test_loss_change_compares_both_ends() -> None:
+    lines = [{"step": step, "train/loss": float(100 - step)} for step in range(10, 101, 10)]
+    assert loss_change([*lines, {"step": 9, "val/loss": 7}]) == {"first_loss": 90.0, "last_loss": 0.0, "val_loss": 7}
+    assert loss_change([]) == {}
+
+
+@pytest.mark.parametrize("overrides", [[], ["experiment=robomme"], ["logger=wandb"], ["logger=none"],
+                                       ["logger=trackio"], ["logger=mlflow"]])  # fmt: skip
+def test_shipped_recipes_are_valid(overrides: list[str]) -> None:
+    config = OmegaConf.to_container(compose("train", overrides), resolve=True)
+    assert isinstance(config, dict)
+    TrainSettings.from_dict(config["train"], config["seed"])
+    json.dumps(config)
+
+
+def test_the_papers_recipe_is_the_papers() -> None:
+    config = compose("train", ["experiment=robomme", "model=framesamp_modul"])
+    recipe = config.train
+    assert (recipe.steps, recipe.batch_size, recipe.lr, recipe.warmup, recipe.ema) == (80_000, 64, 5e-5, 10_000, 0.999)
+    assert config.policy.compute_dtype == "bfloat16"
+    assert config.backbone.vlm.width == 2048
+    assert config.name == "framesamp_modul"
+
+
+def test_weights_to_be_replaced_are_not_rendered_but_a_memory_is_fresh(tmp_path: Path) -> None:
+    base = policy(seed=5)
+    base.save_pretrained(tmp_path)
+    words = ["model=framesamp_expert", "memory.budget=64", *(f"backbone.{k}={v}" for k, v in (("depth", 1),))]
+    words += [f"backbone.vision.{key}={value}" for key, value in SMALL["vision"].items()]
+    built = build_from_config(compose("policy", words), fresh_backbone=False)
+    start_from(built, str(tmp_path))
+    fresh = built.state_dict()
+    assert all(torch.equal(fresh[key], value) for key, value in base.state_dict().items())
+    norm = next(value for key, value in fresh.items() if ".experts.memory.attention_norm.scale" in key)
+    weight = next(value for key, value in fresh.items() if ".experts.memory." in key and value.ndim == 2)
+    assert (norm == 0).all() and 0 < weight.std() < 1

@@ -1,0 +1,129 @@
+"""Videos, contact sheets and the border of conditioning videos."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from mme_vla.embodiment import ROBOMME_JOINT, Camera
+from mme_vla.evaluation.rollout.environment import ChunkEnv
+from mme_vla.evaluation.rollout.video import EpisodeVideo
+from mme_vla.utils.media import (
+    BORDER,
+    CAPTION,
+    RED,
+    Tile,
+    VideoWriter,
+    contact_sheet,
+    evenly_spaced,
+    video_bytes,
+    video_frame,
+    write_video,
+)
+
+GREEN, BLUE, YELLOW = ((0, 200, 0), (0, 0, 200), (200, 200, 0))
+
+
+def baseline(colour: tuple[int, int, int], height: int = 64, width: int = 64) -> np.ndarray:
+    return np.full((height, width, 3), colour, np.uint8)
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24").astype(int) for frame in container.decode(video=0)]
+
+
+class ThreeCameras:
+    """An environment that shows one frame of three cameras, and succeeds at once."""
+
+    def _observation(self, count: int) -> dict[str, list[np.ndarray]]:
+        views = {"front": baseline(GREEN), "wrist": baseline(BLUE), "side": baseline(YELLOW, 48)}
+        joints = {"joint_state_list": [np.zeros(7)] * count, "gripper_state_list": [np.zeros(2)] * count}
+        return joints | {f"{name}_rgb_list": [view] * count for name, view in views.items()}
+
+    def reset(self) -> tuple:
+        return self._observation(2), {"status": "ongoing", "task_goal": ["go"]}
+
+    def step(self, action: np.ndarray) -> tuple:
+        return self._observation(1), 0.0, True, False, {"status": "success"}
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("names", [("side", "front", "wrist"), ("side", "wrist")])
+def test_an_episodes_video_shows_every_camera_of_the_robot(tmp_path: Path, names: tuple[str, ...]) -> None:
+    robot = replace(ROBOMME_JOINT, cameras=tuple(map(Camera, names)), memory_camera="side")
+    env = ChunkEnv(ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot)
+    env.reset()
+    env.step({"actions": np.zeros((1, 8), np.float32)})
+    env.close()
+    frames = decoded(tmp_path / "a.mp4")
+    assert len(frames) == 3 and frames[0].shape == (64 + CAPTION, 3 * 64, 3)
+    inside = [frames[2][24, 64 * view + 32] for view in range(3)]
+    order = [*names, *(name for name in ("front", "wrist") if name not in names)]  # the benchmark's own come last
+    for colour, name in zip(inside, order, strict=True):
+        assert np.abs(colour - {"front": GREEN, "wrist": BLUE, "side": YELLOW}[name]).max() < 25, name
+    assert frames[2][56, 32].max() < 25, "a lower image stands on the upper edge, on black"
+
+
+def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
+    views = [baseline(GREEN), baseline(BLUE, 63, 33)]
+    framed, bare = (video_frame(views, video=video) for video in (True, False))
+    assert framed.shape == bare.shape == (64 + CAPTION, 98, 3), "sides are even"
+    changed = (framed != bare).any(-1)
+    assert changed[:BORDER, :97].all() and changed[:64, :BORDER].all() and not changed[BORDER:54, BORDER:87].any()
+    assert (framed[changed] == RED).all()
+
+
+def test_a_caption_that_is_too_long_ends_within_the_image() -> None:
+    captioned = video_frame([baseline(GREEN)], "pick up the red cube and place it on the target " * 5)
+    assert captioned[64:, :58].max() > 200 and captioned[64:, -4:].max() == 0
+
+
+def test_a_video_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "a.mp4"
+
+    def frames():
+        yield baseline(GREEN)
+        assert not path.exists()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(frames(), path)
+    assert list(path.parent.iterdir()) == []
+    assert write_video([baseline(GREEN)] * 3, path) == len(decoded(path)) == 3
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_video([], path)
+    assert len(decoded(path)) == 3, "the old video stays"
+
+
+def test_equal_frames_make_equal_bytes_and_odd_sides_survive(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (4, 33, 45, 3), dtype=np.uint8)
+    ballast = [
+        np.ones(size, np.uint8) for size in range(1000, 200_000, 5000)
+    ]  # the encoder's memory is not always clean
+    assert len({video_bytes(noise) for _ in range(40) if ballast.pop() is not None}) == 1
+    assert len(video_bytes(noise, crf=10)) > len(video_bytes(noise, crf=30))
+    (tmp_path / "odd.mp4").write_bytes(video_bytes(noise))
+    assert [frame.shape for frame in decoded(tmp_path / "odd.mp4")] == [(33, 45, 3)] * 4
+
+
+def test_a_video_ends_with_its_block(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4", fps=7) as video:
+        video.add(baseline(BLUE))
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].average_rate == 7
+
+
+def test_a_contact_sheet_holds_every_tile_and_outlines_the_highlighted_ones() -> None:
+    tiles = [Tile(baseline(GREEN), "one"), Tile(baseline(BLUE), "two", RED), Tile(baseline(YELLOW), "three")]
+    sheet = np.asarray(contact_sheet(tiles, columns=2, title="all"))
+    for tile in tiles:
+        assert (sheet == tile.image[0, 0]).all(-1).sum() > 150**2, tile.label
+    assert 0 < (sheet == RED).all(-1).sum() < 4 * 2 * 170
+
+
+def test_places_are_distributed_from_the_first_to_the_last() -> None:
+    assert evenly_spaced(9, 3) == [0, 4, 8] and evenly_spaced(2, 5) == [0, 1]

@@ -1,0 +1,250 @@
+"""The front door: loading, starting another variant, converting, and the statistics beside foreign weights."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from helpers import commands
+from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.cli.weights import convert
+from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
+from mme_vla.weights import detect_format, load_weights, open_source, read_stats, start_from, transfer
+from mme_vla.weights.released import released_table
+from mme_vla.weights.tables import memory_parameters
+
+pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
+FORMATS = ["ours", "lerobot", "openpi", "released"]
+
+
+@pytest.fixture(scope="module")
+def bases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One memoryless policy in every format."""
+    folder = tmp_path_factory.mktemp("bases")
+    small_policy("pi05", seed=5).save_pretrained(folder / "ours")
+    for fmt in FORMATS[1:]:
+        convert(folder / "ours", folder / fmt, to=fmt)
+    return {fmt: folder / fmt for fmt in FORMATS}
+
+
+@pytest.fixture(scope="module")
+def base(bases: dict[str, Path]) -> MMEPolicy:
+    """That policy itself, to compare with."""
+    return MMEPolicy.from_pretrained(bases["ours"])
+
+
+def equal(one: MMEPolicy, other: MMEPolicy) -> bool:
+    theirs = other.state_dict()
+    return all(torch.equal(tensor, theirs[name]) for name, tensor in one.state_dict().items())
+
+
+@pytest.mark.parametrize("fmt", FORMATS)
+def test_every_format_is_reported_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path], base: MMEPolicy) -> None:
+    assert detect_format(bases[fmt]) == fmt
+    loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
+    assert equal(loaded, base)
+    assert all(p.requires_grad for p in loaded.parameters())
+
+
+@pytest.mark.parametrize("fmt", ["ours", "openpi", "released"])
+def test_statistics_of_one_dataset_come_with_the_weights(fmt: str, bases: dict[str, Path]) -> None:
+    policy = build_policy("pi05")
+    load_weights(policy, bases[fmt])
+    assert policy.require_processor().stats is not None
+
+
+@pytest.mark.parametrize("fmt", FORMATS)
+@pytest.mark.parametrize("variant", PERCEPTUAL)
+def test_only_the_memorys_parameters_are_new_when_starting_from_pi05(
+    variant: str, fmt: str, bases: dict[str, Path], base: MMEPolicy
+) -> None:
+    policy, loaded = build_policy(variant), base.state_dict()
+    before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
+    new = start_from(policy, bases[fmt])
+    assert set(new) == memory_parameters(policy) == set(before) - set(loaded)
+    assert new
+    for name, tensor in policy.state_dict().items():
+        assert torch.equal(tensor, before[name] if name in new else loaded[name]), name
+
+
+def test_another_variants_memory_is_left_behind_and_reported(tmp_path: Path) -> None:
+    small_policy("framesamp_expert").save_pretrained(tmp_path / "expert")
+    convert(tmp_path / "expert", tmp_path / "released", to="released")
+    for source in ("expert", "released"):
+        policy = small_policy("pi05", seed=3)
+        start = transfer(policy, tmp_path / source)
+        assert start.new == []
+        assert start.left
+        assert "left behind" in str(start)
+        assert torch.equal(
+            policy.backbone.action_in.weight, MMEPolicy.from_pretrained(tmp_path / "expert").backbone.action_in.weight
+        )
+
+
+def test_the_same_variant_starts_completely(tmp_path: Path) -> None:
+    small_policy("framesamp_modul", seed=5).save_pretrained(tmp_path / "ours")
+    convert(tmp_path / "ours", tmp_path / "released", to="released")
+    for source in ("ours", "released"):
+        policy = build_policy("framesamp_modul")
+        assert start_from(policy, tmp_path / source) == []
+        assert equal(policy, MMEPolicy.from_pretrained(tmp_path / "ours"))
+
+
+def test_a_start_never_hides_what_is_missing(bases: dict[str, Path], tmp_path: Path) -> None:
+    tensors = open_source(bases["ours"]).tensors()
+    del tensors["backbone.time_in.bias"]
+    tensors["backbone.embedding.weight"] = torch.zeros(7, 64)
+    save_file(tensors, tmp_path / "model.safetensors")
+    policy = build_policy("framesamp_modul")
+    before = policy.backbone.action_in.weight.clone()
+    with pytest.raises(UserError, match=r"(?s)1 missing:\s+backbone\.time_in\.bias.*embedding.*instead of"):
+        start_from(policy, tmp_path)
+    assert torch.equal(policy.backbone.action_in.weight, before)
+    with pytest.raises(UserError, match="real device"):
+        start_from(build_policy("framesamp_modul", device="meta"), bases["ours"])
+
+
+def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path) -> None:
+    MMEPolicy.from_pretrained(bases["ours"]).save_pretrained(tmp_path)
+    about = json.loads((tmp_path / "processor.json").read_text())
+    (tmp_path / "processor.json").write_text(json.dumps({**about, "tokenizer_fingerprint": "another"}))
+    with pytest.raises(UserError, match="another tokenizer"):
+        start_from(build_policy("framesamp_modul"), tmp_path)
+
+
+@pytest.mark.parametrize("variant", ["pi05", *PERCEPTUAL])
+def test_conversion_there_and_back_keeps_every_bit(variant: str, tmp_path: Path) -> None:
+    policy = small_policy(variant)
+    policy.save_pretrained(tmp_path / "ours")
+    convert(tmp_path / "ours", tmp_path / "released", to="released")
+    assert (tmp_path / "released" / "history_config.txt").is_file() == (variant != "pi05")
+    convert(tmp_path / "released", tmp_path / "back", ["backbone=tiny"])
+    first, last = tmp_path / "ours", tmp_path / "back"
+    assert (first / "model.safetensors").read_bytes() == (last / "model.safetensors").read_bytes()
+    back, batch = MMEPolicy.from_pretrained(last), random_batch(policy)
+    noise = torch.zeros_like(batch.actions)
+    assert torch.equal(back.sample_actions(batch, noise), policy.sample_actions(batch, noise))
+    assert back.require_processor().stats is not None
+
+
+def test_a_destination_is_never_overwritten_and_a_failure_leaves_nothing(
+    bases: dict[str, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "there").mkdir()
+    with pytest.raises(UserError, match="exists"):
+        convert(bases["ours"], tmp_path / "there", to="lerobot")
+    with pytest.raises(UserError, match="misshapen"):
+        convert(bases["lerobot"], tmp_path / "new", ["backbone=tiny", "backbone.vlm.width=128"])
+    small_policy("tokendrop_modul").save_pretrained(tmp_path / "memory")
+    with pytest.raises(UserError, match="memoryless"):
+        convert(tmp_path / "memory", tmp_path / "new", to="openpi")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["memory", "there"]
+
+
+def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
+    small_policy("framesamp_modul").save_pretrained(tmp_path / "ours")
+    convert(tmp_path / "ours", tmp_path / "released", to="released")
+    with pytest.raises(UserError, match="says it is framesamp_modul"):
+        convert(tmp_path / "released", tmp_path / "x", ["model=framesamp_expert", "backbone=tiny"])
+    with pytest.raises(UserError, match="brings its own configuration"):
+        convert(tmp_path / "ours", tmp_path / "x", ["model=framesamp_expert"])
+
+
+@pytest.mark.slow
+def test_the_command_prints_the_mapping_and_saves_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
+    command = ["mme_vla", "weights", str(bases["lerobot"]), str(tmp_path / "new")]
+    done = commands.run(*command, "backbone=tiny", "--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert re.search(
+        r"q_proj\.weight +\S+ +backbone\.transformer\.layers\.\*\.experts\.action\.qkv\.weight", done.stdout
+    )
+    assert "unread" in done.stdout
+    assert re.search(r"tied.*\n.*\n.*lm_head\.weight +\S+embed_tokens\.weight", done.stdout)
+    assert "derived: recomputed constants: none" in done.stdout
+    assert list(tmp_path.iterdir()) == []
+    wrong = commands.run(*command, "backbone=tinny")
+    assert wrong.returncode == 2
+    assert "tiny" in wrong.stderr
+    assert "Traceback" not in wrong.stderr
+
+
+def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tmp_path: Path) -> None:
+    policy = build_policy("pi05")
+    with pytest.raises(UserError, match="no such file"):
+        load_weights(policy, tmp_path / "nowhere")
+    with pytest.raises(UserError, match="no checkpoint of a known kind"):
+        load_weights(policy, tmp_path)
+    save_file({"layer.weight": torch.zeros(2)}, tmp_path / "other.safetensors")
+    with pytest.raises(UserError, match=r"no policy of a known kind.*layer\.weight"):
+        load_weights(policy, tmp_path / "other.safetensors")
+    content = (bases["lerobot"] / "model.safetensors").read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match="damaged"):
+        load_weights(policy, tmp_path / "cut.safetensors")
+    (tmp_path / "adapter_model.safetensors").write_bytes(b"")
+    with pytest.raises(UserError, match="PEFT adapter"):
+        load_weights(policy, tmp_path)
+    (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": 3}')
+    with pytest.raises(UserError, match="not an index"):
+        load_weights(policy, tmp_path)
+    (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": {"a": "shard.safetensors"}}')
+    with pytest.raises(UserError, match=r"shard\.safetensors"):
+        load_weights(policy, tmp_path)
+
+
+def test_a_memory_of_the_user_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
+    policy = build_policy("framesamp_context")
+    monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: {})
+    with pytest.raises(UserError, match="no released names"):
+        released_table(policy)
+    assert set(start_from(policy, bases["released"])) == memory_parameters(policy)
+
+
+# Statistics
+
+
+def test_of_several_datasets_statistics_none_is_taken_with_a_report(bases: dict[str, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "base"
+    shutil.copytree(bases["openpi"], folder)
+    (folder / "assets" / "droid").mkdir(parents=True)
+    unit_stats().save(folder / "assets" / "droid" / "norm_stats.json")
+    policy = build_policy("pi05")
+    with pytest.warns(UserWarning, match=r"statistics of droid, robomme; none were taken.*read_stats\("):
+        load_weights(policy, folder)
+    assert policy.require_processor().stats is None
+
+
+def test_statistics_of_openpi_and_of_several_datasets(tmp_path: Path) -> None:
+    assert read_stats(tmp_path) is None
+    for asset in ("robomme", "droid"):
+        (tmp_path / "assets" / asset).mkdir(parents=True)
+        unit_stats().save(tmp_path / "assets" / asset / "norm_stats.json")
+    with pytest.raises(UserError, match=r"droid, robomme.*asset"):
+        read_stats(tmp_path)
+    with pytest.raises(UserError, match="none of 'libero'"):
+        read_stats(tmp_path, "libero")
+    statistics = read_stats(tmp_path, "robomme")
+    assert statistics is not None
+    assert statistics.to_dict() == unit_stats().to_dict()
+
+
+def test_statistics_of_a_lerobot_processor_come_from_the_file_its_json_names(tmp_path: Path) -> None:
+    file = "policy_preprocessor_step_7_normalizer_processor.safetensors"
+    steps = [{"registry_name": "to_batch"}, {"registry_name": "normalizer_processor", "state_file": file}]
+    (tmp_path / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
+    low, high = -torch.arange(1.0, 9.0), torch.arange(1.0, 9.0)
+    values = {"mean": torch.zeros(8), "std": torch.ones(8), "q01": low, "q99": high, "min": low, "count": torch.ones(1)}
+    features = ("action", "observation.state")
+    save_file({f"{f}.{key}": value.clone() for f in features for key, value in values.items()}, tmp_path / file)
+    stats = read_stats(tmp_path)
+    assert stats is not None
+    assert stats.actions.q99.tolist() == high.tolist()
+    assert stats.state.q01.tolist() == low.tolist()
+    (tmp_path / file).unlink()
+    with pytest.raises(UserError, match="normalizer_processor"):
+        read_stats(tmp_path)
