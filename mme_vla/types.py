@@ -15,7 +15,7 @@ from torch import Tensor
 
 
 def send(x: Tensor, device: torch.device) -> Tensor:
-    """A tensor on a device; from the CPU to a GPU through page-locked memory, so that nobody waits for the copy."""
+    """A tensor on a device; from the CPU to a GPU through page-locked memory, without waiting for the copy."""
     return x.pin_memory().to(device, non_blocking=True) if device.type == "cuda" and not x.is_cuda else x.to(device)
 
 
@@ -59,7 +59,7 @@ class TensorStruct:
         return self._map(lambda x: x.to(*args, **kwargs))
 
     def sent(self, device: torch.device) -> Self:
-        """Return a copy on a device that nobody waits for: see `send`."""
+        """Return a copy on a device, made without waiting: see `send`."""
         return self._map(lambda x: send(x, device))
 
     def rows(self, index: Tensor | slice) -> Self:
@@ -115,7 +115,7 @@ class HistoryTokens(TensorStruct):
     positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's first,
         video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.
-    step: [b] int64; the current frame, counted like the others. None where nobody needs to know.
+    step: [b] int64; the current frame, counted like the others. None where it is not needed.
     """
 
     features: Tensor
@@ -151,8 +151,8 @@ class MemoryTokens(TensorStruct):
 class Overlap(TensorStruct):
     """What a new chunk is to agree with, as it is sampled: actions of the chunk before that are still to be executed.
 
-    actions: [b, h, a]; normalised as the network answers. weight: [b, h, a] in [0, 1]: how firmly each number is meant;
-        0 where nothing was promised.
+    actions: [b, h, a]; normalised as the network predicts. weight: [b, h, a] in [0, 1]: how firmly each number is
+        meant; 0 where nothing was promised.
     """
 
     actions: Tensor

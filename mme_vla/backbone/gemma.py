@@ -31,13 +31,13 @@ KeyValue = tuple[Tensor, Tensor]
 
 
 class StaticKV(NamedTuple):
-    """Keys and values of one layer [b, past + n, K, h]: those of the past, and room for a pass of n tokens."""
+    """Keys and values of one layer [b, past + n, K, h]: those of the past, and space for a pass of n tokens."""
 
     k: Tensor
     v: Tensor
 
     def filled(self, k: Tensor, v: Tensor) -> KeyValue:
-        """All keys and values, this pass's [b, n, K, h] written where the room is."""
+        """All keys and values, this pass's [b, n, K, h] written into the space."""
         for buffer, new in ((self.k, k), (self.v, v)):
             buffer[:, -new.shape[1] :].copy_(new)
         return self.k, self.v
@@ -165,7 +165,7 @@ class JointBlock(nn.Module):
             mask: additive [b, 1, n, past + n], or what another backend of attention reads.
             condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
             hook: see `Hook`, layer already bound.
-            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with room for this pass's own.
+            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with space for this pass's own.
 
         Returns:
             The updated segments (of those that asked), and this pass's keys (rotated) and values.
@@ -208,7 +208,7 @@ class KVCache:
     mask: Tensor  # [b, past] bool
 
     def preallocate(self, tokens: int) -> "KVCache":
-        """The same with room behind it, in which every one of many passes of so many tokens writes its own.
+        """The same with space behind it, in which every one of many passes of so many tokens writes its own.
 
         It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites the last.
         """
@@ -247,7 +247,7 @@ class Conditioning:
 
 
 class JointTransformer(nn.Module):
-    """All layers and the final norm of the one expert that answers; nothing that no action reads."""
+    """All layers and the final norm of the action expert, and nothing that no action reads."""
 
     def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str = "action") -> None:
         super().__init__()

@@ -52,7 +52,7 @@ class ConvTower(nn.Module):
     of tokens, and pooled ones, say where the things of a class are: their middle.
 
     Args:
-        widths: channels of the three stages. blocks: residual blocks of each. out: channels that the answers are read
+        widths: channels of the three stages. blocks: residual blocks of each. out: channels that the outputs are read
             from.
     """
 

@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> None:
         return
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
-        results.notes.insert(0, "Made-up records, drawn from the paper's rates: not a result of anything.")
+        results.notes.insert(0, "Made-up records, sampled from the paper's rates: not a result of anything.")
     comparisons = compare_all(_pairs(results, args.compare), protocol)
     # Piped into a file there is no terminal to fit: as wide as the tables are.
     console = Console(width=None if sys.stdout.isatty() else 200)

@@ -72,7 +72,7 @@ def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) ->
 
 
 def stored_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
-    """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were drawn."""
+    """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were rendered."""
     stored = spec.stored_frames(int(source.lengths[episode]))
     return stored[source.rendered(episode)[stored]]
 

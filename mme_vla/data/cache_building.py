@@ -109,7 +109,7 @@ def build_cache(
 def _of_all(
     source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
 ) -> Iterator[tuple[int, "_Chunk"]]:
-    """The chunks of all episodes, one after the other; an episode of which nothing was drawn has an empty one."""
+    """The chunks of all episodes, one after the other; an episode of which nothing was rendered has an empty one."""
     for episode in episodes:
         yield episode, _Chunk(0, np.zeros((0, 1, 1, 3), np.uint8), [], [])
         for chunk in _chunks(source, episode, memory, batch_size):
@@ -190,7 +190,7 @@ def _build_episode(
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
     if not rows:
-        raise UserError(f"{source.name}, episode {episode}: none of the frames that the memory stores was drawn.")
+        raise UserError(f"{source.name}, episode {episode}: none of the frames that the memory stores was rendered.")
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)

@@ -1,4 +1,4 @@
-"""The progress of this room's long commands: a bar on a terminal, a line now and then anywhere else."""
+"""The progress of the long commands of this package: a bar on a terminal, a line now and then anywhere else."""
 
 import logging
 import time
@@ -11,7 +11,7 @@ from functools import partialmethod
 def quiet_libraries() -> Iterator[None]:
     """Surround work whose progress this library shows itself.
 
-    Notes go that are no warnings; bars of tqdm are drawn on terminals alone, those of `datasets` not at all.
+    Notes go that are no warnings; bars of tqdm appear on terminals alone, those of `datasets` not at all.
     """
     import av.logging
     import tqdm

@@ -246,10 +246,10 @@ def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> N
 
 
 class GroupDataset(TrainingDataset):
-    """Groups of `processor.samples.group_size` steps, drawn from whole records, conditioning videos included.
+    """Groups of `processor.samples.group_size` steps, sampled from whole records, conditioning videos included.
 
     Every episode gives as many groups as every other, whatever its length; an epoch shows about as many steps as there
-    are. A group's steps are distinct, drawn uniformly and sorted; a shorter episode gives all, the last one repeated.
+    are. A group's steps are distinct, sampled uniformly and sorted; a shorter episode gives all, the last one repeated.
     """
 
     def __len__(self) -> int:

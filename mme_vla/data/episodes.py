@@ -197,7 +197,7 @@ class EpisodeSource:
     def decisions(self, episode: int) -> Sequence[int] | np.ndarray:
         """The frames at which the robot decides on actions: all of the execution, or those before a motion begins.
 
-        Of a recording that was drawn at a choice of frames, those of them that every camera shows.
+        Of a recording that was rendered at a choice of frames, those of them that every camera shows.
         """
         first, length = int(self.exec_starts[episode]), int(self.lengths[episode])
         motions = self.robot.action.frames is None
@@ -285,7 +285,8 @@ class EpisodeSource:
             raise UserError(f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
         if not (rendered := self.rendered(episode, camera)[indices]).all():
             raise UserError(
-                f"{self.name}, episode {episode}: {camera} was not drawn at frames {indices[~rendered].tolist()[:5]}. "
+                f"{self.name}, episode {episode}: {camera} was not rendered at frames "
+                f"{indices[~rendered].tolist()[:5]}. "
                 "It was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
             )
         if camera in self._videos:

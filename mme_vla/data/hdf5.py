@@ -45,7 +45,7 @@ POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "act
 CHOICES = ("setup/available_multi_choices", "timestep_0/action/choice_action", "timestep_0/info/is_subgoal_boundary")
 """What an episode has whose options and choices were recorded."""
 FRAMES = "setup/frames"
-"""Where a file keeps the choice of frames it was recorded at, as JSON, if not all were drawn."""
+"""Where a file keeps the choice of frames it was recorded at, as JSON, if not all were rendered."""
 _IMAGE_KEYS = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
 _REQUIRED = (
     "obs/joint_state", "obs/gripper_state", "action/joint_action", "info/is_video_demo", "info/is_completed",
@@ -61,8 +61,8 @@ class RawFrame:
     action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
     is_demo: the step belongs to the conditioning video.
     subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
-    drawn: the cameras that were drawn at this step; of the others `front` and `wrist` repeat an earlier image (the
-        first one, before there is any).
+    rendered: the cameras that were rendered at this step; of the others `front` and `wrist` repeat an earlier image
+        (the first one, before there is any).
     """
 
     front: np.ndarray
@@ -141,7 +141,7 @@ class RawEpisode:
     def _image(self, step: int, camera: str) -> np.ndarray:
         if self.frames is not None and not self.rendered[camera][step]:
             raise UserError(
-                f"{self.ref.file} {self.ref.group}: {camera} was not drawn at step {step}; the episode was recorded "
+                f"{self.ref.file} {self.ref.group}: {camera} was not rendered at step {step}; the episode was recorded "
                 f"with frames={self.frames['at']}."
             )
         return self._checked(
@@ -173,7 +173,7 @@ class RawEpisode:
 
     @cached_property
     def frames(self) -> dict[str, Any] | None:
-        """The choice of frames it was recorded at; None for one that was drawn whole."""
+        """The choice of frames it was recorded at; None for one that was rendered whole."""
         if FRAMES not in self._group:
             return None
         settings: dict[str, Any] = parse_json(self._text(FRAMES), self._path(FRAMES))

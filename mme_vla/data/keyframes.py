@@ -183,9 +183,9 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
     """Runs of keyframes from the chains of several datasets' episodes.
 
     There are as many samples to an epoch as places to begin at: with `length` 1 one for every transition of every
-    chain, else one for every chain that is long enough. What is drawn is fair to tasks, as released: with `length` 1 a
-    task, then one of its transitions; else a task, one of its episodes and a chain of that, drawn again where the chain
-    is too short, and a window of it. Held-out samples are gone through one by one.
+    chain, else one for every chain that is long enough. What is sampled is fair to tasks, as released: with `length` 1
+    a task, then one of its transitions; else a task, one of its episodes and a chain of that, sampled again where the
+    chain is too short, and a window of it. Held-out samples are gone through one by one.
     """
 
     def __init__(
@@ -203,14 +203,14 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         Args:
             length: k; keyframes of a sample.
             episodes: which of each source's episodes to use; None uses all.
-            sampled: whether a sample is drawn anew each epoch; else it is the place of its number.
+            sampled: whether a sample is sampled anew each epoch; else it is the place of its number.
         """
         self.sources, self.processor, self.length = list(sources), processor, length
         self.seed, self.epoch = seed, 0
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self.total_frames, self.sampled = 0, sampled
         self._items: list[tuple[int, int, EpisodeKeyframes, list[Link]]] = []
-        shares: list[float] = []  # how often an item is drawn within its task, relative to the task's others
+        shares: list[float] = []  # how often an item is sampled within its task, relative to the task's others
         tasks: list[str] = []
         counted: Counter[str] = Counter()
         longest = 0
@@ -247,7 +247,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
     def window(self, index: int) -> tuple[int, int, EpisodeKeyframes, list[Link]]:
         """Source, episode, its keyframes, and those of them that an item holds in this epoch.
 
-        A chain's last window is drawn only if it is the only one, as in the released code.
+        A chain's last window is sampled only if it is the only one, as in the released code.
         """
         rng = np.random.default_rng([self.seed, self.epoch, index])
         if self.sampled:

@@ -22,7 +22,7 @@ from mme_vla.utils import decoding, inside, read_json, require_file
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
 RENDERED_SUFFIX = "_drawn"
-"""After a camera's name: the column that says which frames it was drawn at, where not at all."""
+"""After a camera's name: the column that says which frames it was rendered at, where not at all."""
 NAMES: Mapping[str, Mapping[str, str]] = {
     "robomme": {},
     "lerobot": {

@@ -3,7 +3,7 @@
 `mme-vla sample FULL_FOLDER THINNED_FOLDER`
 
 Four real demonstrations, one of them with an image for every step, as a LeRobot v3.0 dataset of under 6 MB. It exists
-so that the first command of the README needs nothing else; nobody has to run this again.
+so that the first command of the README needs nothing else; users need not run this.
 """
 
 import shutil

@@ -1,7 +1,7 @@
 """Images out of video files, by time stamp, with PyAV.
 
 PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's libraries from the
-system and is not used. Files stay open between calls, as many as the process may hold: samples are drawn from all
+system and is not used. Files stay open between calls, as many as the process may hold: samples are sampled from all
 episodes at random, and opening a file takes longer than decoding an image.
 """
 

@@ -1,4 +1,4 @@
-"""`Integration`: the one room that knows both memory and backbone, through the backbone's two doors."""
+"""`Integration`: the one package that knows both memory and backbone."""
 
 from collections.abc import Callable, Sequence
 from typing import ClassVar

@@ -34,7 +34,7 @@ class FrameSamp(PerceptualMemory):
         """See `PerceptualMemory`; `grid` is the side of a remembered frame's token grid.
 
         Args:
-            every: frames 0 and k·every − 1 can be remembered; the others are neither drawn nor encoded. 1: all.
+            every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor encoded. 1: all.
         """
         if budget % grid**2 or budget < grid**2:
             raise UserError(

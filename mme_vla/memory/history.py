@@ -159,8 +159,8 @@ class History:
             lost = sorted(set(np.asarray(frames).tolist()) - set(stored.tolist()))
             raise UserError(
                 f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames and keeps frame 0 "
-                f"and every {self.spec.keep_every}th, as far as they were drawn. The memory selects frames that its "
-                "StorageSpec does not keep, or that its `frames_read` does not name and nobody drew."
+                f"and every {self.spec.keep_every}th, as far as they were rendered. The memory selects frames that its "
+                "StorageSpec does not keep, or that its `frames_read` does not name, which are not rendered."
             )
         return rows
 

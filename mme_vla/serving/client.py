@@ -75,7 +75,7 @@ class Client:
             message = bytes(reply).decode(errors="replace").strip()
             raise UserError(f"The server at {self.url} refuses the connection: {message or error}") from None
         except (OSError, TimeoutError, EOFError) as error:
-            raise ConnectionError(f"No policy server answers at {self.url}: {error}") from error
+            raise ConnectionError(f"No policy server responds at {self.url}: {error}") from error
         self.metadata = self._receive(self.open_timeout)
 
     def reset(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """`SubgoalPredictor`: language subgoals for many running episodes at once.
 
-As with the policy, what belongs to one episode lives in an object of its own (`start_episode`), and `predict` answers
+As with the policy, what belongs to one episode lives in an object of its own (`start_episode`), and `predict` returns
 for many episodes in one batch.
 """
 

@@ -57,7 +57,7 @@ def stop_requests() -> Iterator[StopRequest]:
 
 
 def leave_signals_alone(worker: int) -> None:
-    """Signals go to every process of a group, data workers included: the training process alone answers them.
+    """Signals go to every process of a group, data workers included: the training process alone handles them.
 
     A data worker ends with it, also when it is killed.
     """

@@ -215,7 +215,7 @@ def fitted(text: str, width: int, size: int) -> str:
 
 
 def _routines() -> dict[str, str]:
-    """Keeps x264 from its AVX-512 routines, which read memory that nobody wrote: equal frames made unequal bytes."""
+    """Keeps x264 from its AVX-512 routines, which read uninitialised memory: equal frames made unequal bytes."""
     import torch
 
     if torch.backends.cpu.get_cpu_capability() != "AVX512":

@@ -13,7 +13,7 @@ from multiprocessing.connection import wait
 def end_with_parent() -> None:
     """Called first in a worker: it ends as soon as its parent is gone, even a killed one, and ignores Ctrl-C.
 
-    Ctrl-C goes to every process of a terminal; the parent alone answers it, and ends its workers.
+    Ctrl-C goes to every process of a terminal; the parent alone handles it, and ends its workers.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

@@ -52,7 +52,7 @@ def load_weights(
 ) -> Policy:
     """Fill a policy with a checkpoint of the same variant, in any format this library knows.
 
-    The policy may lie on the meta device, so that no weight is drawn only to be replaced. A checkpoint that
+    The policy may lie on the meta device, so that no weight is initialised only to be replaced. A checkpoint that
     carries the statistics of one dataset hands them to the policy's processor; LeRobot's are left (see `read_stats`),
     and of several none is taken, with a warning that names them.
 

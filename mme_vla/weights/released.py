@@ -1,4 +1,4 @@
-"""The released (JAX) parameter trees: names to ours and back, for any composition whose rooms supply a name table.
+"""The released (JAX) parameter trees: names to ours and back, for any composition whose packages supply a name table.
 
 Leaves are named without the leading `params/` and the trailing `/value`; layers are stacked on the first axis.
 `orbax.py` reads and writes the files.

@@ -1,6 +1,6 @@
 """Name tables: how a foreign checkpoint names and lays out our tensors, written once and read in both directions.
 
-A room supplies a table for its own modules; an adapter in `weights/` applies the tables to whole checkpoints.
+A package supplies a table for its own modules; an adapter in `weights/` applies the tables to whole checkpoints.
 """
 
 import math

@@ -96,7 +96,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> EpisodeRef:
 def test_what_is_rendered_is_what_a_full_recording_shows(recorded: EpisodeRef) -> None:
     with open_episode(recorded) as episode:
         frames, rendered, seed, choice = list(episode), episode.rendered, episode.seed, episode.frames
-        with pytest.raises(UserError, match=r"front was not drawn at step 1; .* frames=decisions"):
+        with pytest.raises(UserError, match=r"front was not rendered at step 1; .* frames=decisions"):
             episode.front(1)
     assert choice == {"at": "decisions", "memory": {"name": "framesamp", "budget": 64}}
     # What of a whole recording is compared, and the steps before, whose images these would be if any were stale.
@@ -127,5 +127,5 @@ def test_a_dataset_of_it_is_read_where_it_was_rendered_and_nowhere_else(recorded
         first = int(np.flatnonzero(rendered)[0])
         assert np.abs(joints.frames(0, [first])[0].astype(int) - episode.front(first)).max() <= 3
     unseen = int(np.flatnonzero(~joints.rendered(0))[0])
-    with pytest.raises(UserError, match=rf"front was not drawn at frames \[{unseen}\]"):
+    with pytest.raises(UserError, match=rf"front was not rendered at frames \[{unseen}\]"):
         joints.frames(0, [first, unseen])

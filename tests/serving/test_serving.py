@@ -317,7 +317,7 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
         for client in (idle, busy):
             with pytest.raises(ConnectionError, match=r"1001.*stopping"):
                 client.reset()
-        with pytest.raises(ConnectionError, match="No policy server answers"):
+        with pytest.raises(ConnectionError, match="No policy server responds"):
             served.client()
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Table:
-    """A table of text. rules: rows before which a line is drawn. strong: rows in bold."""
+    """A table of text. rules: rows before which a line is printed. strong: rows in bold."""
 
     title: str
     columns: Sequence[str]

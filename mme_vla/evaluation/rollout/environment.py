@@ -1,6 +1,6 @@
 """The environment's side of a rollout, in a worker process: executes whole chunks and hands back every frame.
 
-A worker gets a chunk at a time, so it simulates on while the policy answers others. Its frames come in the form the
+A worker gets a chunk at a time, so it simulates on while the policy acts in others. Its frames come in the form the
 policy reads, and its report says where the time went.
 """
 

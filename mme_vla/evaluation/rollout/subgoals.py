@@ -32,7 +32,7 @@ class SubgoalScore:
 
     chunks: times the policy acted. judged: of these, how often the environment had a subgoal to compare with.
     right: how often the text was the environment's. points, distance: points compared, and the sum of their distances
-    in pixels of the front image. asked: questions to a model. problems: unusable answers by kind.
+    in pixels of the front image. asked: questions to a model. problems: unusable replies by kind.
     """
 
     chunks: int = 0

@@ -82,7 +82,7 @@ class LSTMLayer(RecurrentLayer):
     def __init__(self, hidden: int, layers: int, budget: int, longest: int) -> None:
         super().__init__()
         self.hidden, self.budget = hidden, budget
-        self.norm = nn.LayerNorm(hidden)  # a fresh encoder's answers are small: the gates would hardly move
+        self.norm = nn.LayerNorm(hidden)  # a fresh encoder's outputs are small: the gates would hardly move
         inputs = [nn.Linear(hidden, 4 * hidden) for _ in range(layers)]
         self.inputs = nn.ModuleList(inputs)
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers))

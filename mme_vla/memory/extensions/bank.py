@@ -23,7 +23,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 @MEMORIES.register("bank")
 class Banked(FrameMemory):
-    """grid×grid tokens of the current frame, each fused with what the bank answers to it."""
+    """grid×grid tokens of the current frame, each fused with what it retrieves from the bank."""
 
     pad_left = True
 
@@ -181,7 +181,7 @@ class Retrieval(nn.Module):
 
         Args:
             times: for the time code, where there is one.
-            valid: [b, t] bool, False where there is no entry; a row without any answers with its tokens.
+            valid: [b, t] bool, False where there is no entry; a row without any returns its tokens.
         """
         keys = entries
         if self.time is not None:
@@ -247,7 +247,7 @@ class MemoryBank(Retrieval):
         return BankState(weight.new_zeros(0, tokens, self.width), times)
 
     def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
-        """What the banks of b episodes answer to their current tokens [b, n, d]; an empty one answers with these."""
+        """What the current tokens [b, n, d] of b episodes retrieve from their banks; an empty bank returns these."""
         lengths = [len(state) for state in states]
         longest = max(lengths)
         if not longest:

@@ -1,10 +1,10 @@
-"""Moment: a few learned tokens ask every frame, and a small causal encoder sets their answers in context (HAMLET).
+"""Moment: a few learned tokens ask every frame, and a small causal encoder puts their outputs in context (HAMLET).
 
 After "HAMLET: Switch your Vision-Language-Action Model into a History-Aware Policy" (arXiv 2510.00695): four moment
 tokens a time step, a memory module of two causal layers over the steps, the four of the current step read by the
 action head. Three things are otherwise here, because a memory stands before the language model and has no loss of its
 own: the tokens ask the frame's stored vision tokens, not the language model; they begin at random, without the paper's
-time-contrastive stage; and the encoder's answers of all steps are handed over, the current ones last, so that an
+time-contrastive stage; and the outputs of the encoder for all steps are handed over, the current ones last, so that an
 integration may look at a moment at its time. The paper looks back four steps; this memory as far as its budget goes.
 """
 
