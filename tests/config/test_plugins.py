@@ -101,7 +101,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def stranger(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def foreign_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder, in a process that has not imported what lies there."""
     for name in [name for name in sys.modules if name.split(".")[0] == OWN]:
         monkeypatch.delitem(sys.modules, name)

@@ -56,7 +56,7 @@ def test_many_differences_become_a_digest_that_depends_on_all_of_them() -> None:
 
 
 @pytest.fixture
-def custom(tmp_path: Path) -> Path:
+def config_folder(tmp_path: Path) -> Path:
     for file, text in OWN.items():
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / file).write_text(textwrap.dedent(text))

@@ -26,7 +26,7 @@ def recorded(tmp_path_factory) -> tuple[list[EpisodeRef], list[Recorded]]:
 
 
 @pytest.fixture(scope="module")
-def filmed(recorded, tmp_path_factory) -> tuple[Path, list[Recorded]]:
+def video_dataset(recorded, tmp_path_factory) -> tuple[Path, list[Recorded]]:
     """The episodes as a dataset with videos."""
     refs, episodes = recorded
     folder = tmp_path_factory.mktemp("filmed") / "out"

@@ -64,14 +64,14 @@ def package() -> Iterator[ModuleType]:
 
 
 @pytest.fixture(scope="module")
-def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def our_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ours") / "policy"
     small_policy(MODEL).save_pretrained(folder)
     return folder
 
 
 @pytest.fixture(scope="module")
-def theirs(package: ModuleType, our_folder: Path) -> Path:
+def lerobot_folder(package: ModuleType, our_folder: Path) -> Path:
     """The same policy as LeRobot's commands know it."""
     folder = our_folder.parent / "theirs"
     package.convert.main([str(our_folder), str(folder)])

@@ -32,7 +32,7 @@ def training(policy: MMEPolicy) -> tuple[MMEPolicy, EMA, torch.optim.Optimizer]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A training checkpoint after one update."""
     policy, ema, optimizer = training(tiny())
     for parameter in policy.parameters():
