@@ -6,35 +6,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from timm.optim.lamb import Lamb
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from mme_vla.training.parallel import like
 from mme_vla.training.settings import TrainSettings
-
-
-class ClippedLamb(Lamb):
-    """timm's LAMB, scaling updates down and never up; it counts its steps in each parameter's state, as Adam does.
-
-    timm counts them in the group, which checkpoints do not keep: the correction of the moments' bias would start anew.
-    """
-
-    def __init__(self, params: Any, **options: Any) -> None:
-        super().__init__(params, trust_clip=True, max_grad_norm=None, **options)
-
-    def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """One update."""
-        for group in self.param_groups:
-            counts = [self.state[p]["step"] for p in group["params"] if p in self.state and "step" in self.state[p]]
-            if counts:
-                group["step"] = counts[0].clone()
-        loss = super().step(closure)
-        for group in self.param_groups:
-            for p in group["params"]:
-                if p in self.state:
-                    self.state[p]["step"] = group["step"].clone()
-        return loss
 
 
 def learning_rate(step: int, peak: float, warmup: int) -> float:
@@ -75,6 +51,8 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) 
     others: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim < least], "weight_decay": 0.0}
     groups = [group for group in (decayed, others) if group["params"]]
     if settings.optimizer == "lamb":
+        from mme_vla.training.lamb import ClippedLamb  # imports timm, and so torchvision
+
         return ClippedLamb(
             groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay
         )

@@ -61,7 +61,7 @@ print(json.dumps(said))
 
 
 @pytest.fixture(scope="module")
-def message() -> dict[str, str]:
+def reports() -> dict[str, str]:
     """How each of them failed; empty where it did not."""
     done = subprocess.run(
         [sys.executable, "-c", TRY], input=json.dumps(WITHOUT), capture_output=True, text=True, cwd=REPOSITORY
