@@ -127,6 +127,7 @@ def test_a_derived_robot_description_is_saved_once(tmp_path, monkeypatch):
 
 
 def test_the_official_layout_and_words_come_out_of_the_seed(pick, h5_folder):
+    pick.reset()
     assert pick.goals() == [goal.decode() for goal in setup(h5_folder, *PICK, "task_goal")]
     waypoints = recorded(h5_folder, *PICK, "action/waypoint_action")
     stages = [waypoints[k, :2] for k in (6, 144, 238)]
