@@ -117,7 +117,7 @@ def _train(
     if init_from is not None and holds:
         line.say(start_from(policy, init_from))
     with nullcontext() if holds else torch.device("meta"):
-        apply_finetuning(policy, **config["finetune"])
+        apply_finetuning(policy, **config["finetune"], seed=config["seed"])
     if run.checkpoint is not None:
         if holds:
             load_policy(run.checkpoint, policy)

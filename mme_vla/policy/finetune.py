@@ -62,6 +62,7 @@ def apply_finetuning(
     targets: Sequence[str] | None = None,
     train: Sequence[str] | None = None,
     frozen_dtype: str | None = None,
+    seed: int = 42,
 ) -> dict[str, int]:
     """Set which parameters of a policy receive gradients; in mode `lora`, add the adapters that do.
 
@@ -79,6 +80,7 @@ def apply_finetuning(
             default the memory and the policy's heads.
         frozen_dtype: `bfloat16` holds what is not trained at half the size, as the released training does; it rounds
             those weights, and requires compute in bfloat16.
+        seed: of A, which the state of PyTorch's own generators does not change.
 
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
@@ -90,7 +92,7 @@ def apply_finetuning(
     train = ("memory", *spec.full_train) if train is None else train
     if mode == "lora":
         in_full = _named(policy, train)  # before anything is changed
-        add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets)
+        add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets, seed=seed)
     for name, parameter in policy.named_parameters():
         part = spec.component_of(name)
         if mode == "full":
@@ -135,6 +137,7 @@ def add_adapters(
     dropout: float = 0.0,
     init: str = "uniform",
     targets: Sequence[str] | None = None,
+    seed: int = 42,
 ) -> None:
     """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
     if policy.config.get("adapters") and _has_adapters(policy):
@@ -153,7 +156,9 @@ def add_adapters(
         raise missing_extra("LoRA", "vlm") from None
     options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": target_modules, "init_lora_weights": INITS[init]}
     config = LoraConfig(r=rank, lora_dropout=dropout, **options)
-    inject_adapter_in_model(config, policy, ADAPTER)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        inject_adapter_in_model(config, policy, ADAPTER)
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}
 
 

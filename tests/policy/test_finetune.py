@@ -61,6 +61,19 @@ def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None
     assert [name for name in learning(policy) if policy.get_parameter(name).grad is None] == []
 
 
+def test_adapters_follow_from_their_seed_alone() -> None:
+    pytest.importorskip("peft", reason="LoRA needs the extra 'vlm'")
+
+    def adapters(before: int, seed: int) -> torch.Tensor:
+        policy = small_policy("pi05", backbone=FEW_TOKENS)
+        torch.manual_seed(before)
+        apply_finetuning(policy, "lora", seed=seed)
+        return torch.cat([p.flatten() for name, p in policy.named_parameters() if ".lora_A." in name])
+
+    assert torch.equal(adapters(1, seed=7), adapters(2, seed=7))
+    assert not torch.equal(adapters(1, seed=7), adapters(1, seed=8))
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> None:
     pytest.importorskip("peft", reason="LoRA needs the extra 'vlm'")
