@@ -1,18 +1,16 @@
-"""Writes docs/api.md, what `from mme_vla import …` offers, from signatures and docstrings: `python docs/api.py`."""
+"""The page of what `from mme_vla import …` offers, from signatures and docstrings."""
 
 import inspect
 import re
-from pathlib import Path
 from typing import Any
 
 import mme_vla
 from mme_vla.registry import Registry
 
-PAGE = Path(__file__).resolve().parent / "api.md"
-INTRODUCTION = """# What `mme_vla` offers
+INTRODUCTION = """# API
 
-Written by `python docs/api.py` from the docstrings; a test keeps the two equal. Everything below is imported from
-`mme_vla` itself, and loaded when it is first used. [From Python](python.md) shows it at work.
+Everything below is imported from `mme_vla` itself, and loaded when it is first used. [From Python](../start/python.md)
+shows it at work.
 """
 GROUPS = {
     "A policy": ["build_policy", "MMEPolicy", "Policy", "Episode", "load_weights"],
@@ -92,12 +90,9 @@ def page() -> str:
     known = {name for name in mme_vla.__all__ if name != "__version__"}
     rest = {name for name in known if not isinstance(getattr(mme_vla, name), Registry)}
     if rest != named:
-        raise ValueError(f"docs/api.py: these names stand in no group, or in one too many: {sorted(rest ^ named)}")
+        raise ValueError(f"scripts/site/api.py, GROUPS: these public names are in no group, or in one too many: {sorted(rest ^ named)}")
     parts = [INTRODUCTION.strip()]
     for title, names in GROUPS.items():
         parts += [f"## {title}", *map(section, names)]
     return "\n\n".join(parts) + "\n"
 
-
-if __name__ == "__main__":
-    PAGE.write_text(page())
