@@ -82,7 +82,7 @@ def test_each_command_has_a_page_with_its_options() -> None:
     pages = command_pages.pages()
     assert set(pages) == {f"reference/commands/{command}.md" for command in COMMANDS}
     assert "| `max_steps` |" in pages["reference/commands/evaluate.md"]
-    assert "../configuration/memory.md" in pages["reference/commands/train.md"]
+    assert "| [`model`](../configuration/model.md) |" in pages["reference/commands/train.md"]
     assert "--compare" in pages["reference/commands/results.md"]
     for command in COMMANDS:
         page = pages[f"reference/commands/{command}.md"]
