@@ -84,15 +84,15 @@ def memory(source: EpisodeSource) -> Figure:
     """What four memories read at the last step: a timeline each, and some of the frames with their patches."""
     start, length = int(source.exec_starts[EPISODE]), int(source.lengths[EPISODE])
     figure = plt.figure(figsize=(11, 10.5))
-    for row, (part, (name, (kind, options, reads))) in enumerate(
-        zip(figure.subfigures(len(MEMORIES), 1), MEMORIES.items(), strict=True)
-    ):
+    parts = figure.subfigures(len(MEMORIES), 1)
+    for part, (name, (kind, options, reads)) in zip(parts, MEMORIES.items(), strict=True):
         built = kind(WIDTH, WIDTH, **options)
         history = replay(built, source)
         selected = built.select(history, length - 1)
         counts = np.bincount(selected[:, 0], minlength=length)
         frames = np.flatnonzero(counts)
-        grid = part.add_gridspec(2, TILES, height_ratios=[0.35, 1], left=0.02, right=0.98, bottom=0.02, top=0.86, hspace=0.55)
+        place = {"left": 0.02, "right": 0.98, "bottom": 0.02, "top": 0.86, "hspace": 0.55}
+        grid = part.add_gridspec(2, TILES, height_ratios=[0.35, 1], **place)
         line = part.add_subplot(grid[0, :])
         line.bar(frames, counts[frames], width=0.9, color=[VIDEO if f < start else EXECUTION for f in frames])
         phases(line, start, length)
@@ -120,7 +120,9 @@ def history(source: EpisodeSource) -> Figure:
         past = replay(built, source)
         read = np.array([np.bincount(built.select(past, t)[:, 0], minlength=length) for t in range(length)])
         share = read / built.storage.grid**2
-        raster.imshow(share.T**0.5, origin="lower", cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest")
+        raster.imshow(
+            share.T**0.5, origin="lower", cmap="Blues", vmin=0, vmax=1, aspect="auto", interpolation="nearest"
+        )
         raster.axhline(start, color=EXECUTION, lw=0.8)
         raster.axvline(start, color=EXECUTION, lw=0.8)
         raster.set(title=name, ylabel="frame that is read" if column == 0 else "")
@@ -200,7 +202,9 @@ def probe(folder: Path) -> Figure:
     figure, axes = plt.subplots(figsize=(7, 0.4 * len(names) + 1.2), layout="constrained")
     bars = axes.barh(names, [effects[name].change for name in names], color="#1f6f8b")
     axes.bar_label(bars, fmt="%.2f", padding=3)
-    axes.axvline(np.mean([each.spread for each in effects.values()]), color=EXECUTION, ls="--", label="own spread: noise alone")
+    axes.axvline(
+        np.mean([each.spread for each in effects.values()]), color=EXECUTION, ls="--", label="own spread: noise alone"
+    )
     axes.set_xlabel("change of the chunk, normalised actions")
     axes.legend(frameon=False)
     return figure
@@ -213,7 +217,9 @@ FIGURES: dict[str, Callable[[EpisodeSource], Figure]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("figures", nargs="*", choices=[[], *FIGURES, "probe"], metavar="figure", help="by default all but probe")
+    parser.add_argument(
+        "figures", nargs="*", choices=[[], *FIGURES, "probe"], metavar="figure", help="by default all but probe"
+    )
     parser.add_argument("--probe", type=Path, help="folder of a finished probe")
     parser.add_argument("--output", type=Path, default=FOLDER)
     options = parser.parse_args()

@@ -32,7 +32,14 @@ def encode(snapshots: list[Snapshot]) -> bytes:
     for quality in range(70, 0, -10):
         buffer = BytesIO()
         images[0].save(
-            buffer, "WEBP", save_all=True, append_images=images[1:], duration=durations, loop=0, quality=quality, method=6
+            buffer,
+            "WEBP",
+            save_all=True,
+            append_images=images[1:],
+            duration=durations,
+            loop=0,
+            quality=quality,
+            method=6,
         )
         if buffer.tell() <= LIMIT:
             return buffer.getvalue()
