@@ -38,7 +38,7 @@ def build_site(output: Path) -> Path:
 def main() -> None:
     """Run `mme-vla docs`."""
     parser = argparse.ArgumentParser(prog="mme-vla docs", description=str(__doc__).partition(": ")[2])
-    parser.add_argument("--output", type=Path, default=Path("outputs/site"), help="folder of the site (default: %(default)s)")
+    parser.add_argument("--output", type=Path, default=Path("outputs/site"), help="folder of the site (%(default)s)")
     parser.add_argument("--build", action="store_true", help="build only, open no browser")
     arguments = parser.parse_args()
     logging.getLogger("mkdocs").addHandler(logging.StreamHandler())  # its warnings, which are errors here

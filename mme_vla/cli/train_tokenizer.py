@@ -58,7 +58,9 @@ def read_corpus() -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train on the shipped corpus and write `tokenizer.model` into a folder."""
     parser = argparse.ArgumentParser(prog="mme-vla train-tokenizer", description=str(__doc__).partition("\n")[0])
-    parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="where to write tokenizer.model (default: here)")
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=Path(), help="where to write tokenizer.model (default: here)"
+    )
     path = parser.parse_args(arguments).folder / "tokenizer.model"
     path.write_bytes(train_tokenizer(read_corpus()))
     print(f"Wrote {path} ({VOCAB_SIZE} pieces).")

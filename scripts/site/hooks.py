@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote
 
-import api
-import commands
-import configuration
+import api_pages
+import command_pages
+import config_pages
+import notebook_pages
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 if TYPE_CHECKING:
@@ -21,16 +23,20 @@ if TYPE_CHECKING:
     from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
-FROM_ROOT = {"index.md": "README.md", "reference/changes.md": "CHANGELOG.md", "extend/contributing.md": "CONTRIBUTING.md"}
+FROM_ROOT = {
+    "index.md": "README.md",
+    "reference/changes.md": "CHANGELOG.md",
+    "extend/contributing.md": "CONTRIBUTING.md",
+}
 """Pages that are files of the repository's root."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
-LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".ipynb": "json", ".sh": "bash", ".toml": "toml"}
+LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
 
 
 def generated() -> dict[str, str]:
     """Path under `docs/` → Markdown, of every page that is written at build time."""
     copies = {page: (ROOT / file).read_text(encoding="utf-8") for page, file in FROM_ROOT.items()}
-    return {**copies, "reference/api.md": api.page(), **configuration.pages(), **commands.pages()}
+    return {**copies, "reference/api.md": api_pages.page(), **config_pages.pages(), **command_pages.pages()}
 
 
 def on_files(files: Files, config: "MkDocsConfig") -> Files:
@@ -45,12 +51,16 @@ def on_files(files: Files, config: "MkDocsConfig") -> Files:
 
 
 def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
-    """Point links to files of the repository at their pages in the site."""
+    """Point links to files of the repository at their pages in the site; in the search, rank evidence last."""
+    if page.file.src_uri.startswith("evidence/"):
+        page.meta["search"] = {"boost": 0.5}
     return relink(page.file.src_uri, markdown)
 
 
 def origin(path: str) -> str:
     """Where the text of a page stands in the repository, which its relative links start from."""
+    if path.startswith("source/"):
+        return path.removeprefix("source/").removesuffix(".md")
     return FROM_ROOT.get(path, f"docs/{path}")
 
 
@@ -73,7 +83,7 @@ def outside(path: str, text: str) -> set[str]:
     """The files and folders that a page links to and that are neither in `docs/` nor a page of the site.
 
     Raises:
-        FileNotFoundError: a link leads to no file.
+        PluginError: a link leads to no file.
     """
     targets = set()
     for _, link, _ in LINK.findall(without_code(text)):
@@ -81,7 +91,7 @@ def outside(path: str, text: str) -> set[str]:
         if target is None or not shown_as(target).startswith("source/"):
             continue
         if not (ROOT / target).exists():
-            raise FileNotFoundError(f"docs/{path} links to {link}, which does not exist.")
+            raise PluginError(f"{origin(path)} links to {link}, which does not exist.")
         targets.add(target)
     return targets
 
@@ -111,6 +121,8 @@ def outside_of_code(text: str, change: Callable[[str], str]) -> str:
 def source_page(target: str) -> str:
     """A file of the repository as a page: its text, or the names of a folder's files."""
     path = ROOT / target
+    if path.suffix == ".ipynb":
+        return notebook_pages.page(path)
     if path.is_dir():
         names = sorted(str(file.relative_to(path)) for file in path.rglob("*") if is_source(file))
         text, language = "\n".join(names), "text"

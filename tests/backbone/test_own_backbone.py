@@ -1,4 +1,4 @@
-"""The worked example of docs/extend/add-a-backbone.md: checked, trained with a memory by the command, asked for actions."""
+"""The worked example of docs/extend/add-a-backbone.md: checked, trained with a memory by the command, acts."""
 
 import runpy
 import sys

@@ -169,5 +169,5 @@ def test_what_the_tutorials_write_is_ignored_by_git() -> None:
 
 
 def test_pages_have_no_placeholder_that_a_shell_takes_for_a_redirection() -> None:
-    for page in (REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md")):
+    for page in (REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")):
         assert "<time>" not in page.read_text(), page

@@ -1,4 +1,4 @@
-"""The worked example of docs/extend/add-an-integration.md: an integration outside the package is checked, learns and acts."""
+"""The worked example of docs/extend/add-an-integration.md: an integration of one's own is checked, learns and acts."""
 
 import numpy as np
 import pytest

@@ -5,7 +5,6 @@ import re
 from typing import Any
 
 import mme_vla
-from mme_vla.registry import Registry
 
 INTRODUCTION = """# API
 
@@ -28,7 +27,7 @@ GROUPS = {
 
 
 def signature(thing: Any) -> str:
-    """The arguments as written, without the homes of the types' names."""
+    """The arguments as written, without the modules of the types' names."""
     try:
         text = str(inspect.signature(thing))
     except (TypeError, ValueError):
@@ -36,6 +35,24 @@ def signature(thing: Any) -> str:
     text = re.sub(r"<function (\w+) at \w+>", r"\1", text)
     text = re.sub(r"(: |-> )'([^']+)'", r"\1\2", text)  # types that are named before they exist
     return re.sub(r"\b(?:[a-z_]\w*\.)+(?=[A-Za-z_])", "", text)
+
+
+def wrapped(call: str, width: int = 76) -> str:
+    """A call with each argument on a line of its own where it is wider than the page's code blocks."""
+    if len(call) <= width:
+        return call
+    lines, depth = [""], 0
+    for character in call:
+        depth -= character in ")]}"
+        if depth == 0 and character == ")" and len(lines) > 1:
+            lines.append("")
+        lines[-1] += character
+        if depth == 0 and character == "(" and len(lines) == 1:
+            lines.append("    ")
+        depth += character in "([{"
+        if depth == 1 and character == "," and len(lines) > 1:
+            lines.append("   ")
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def text_of(thing: Any) -> str:
@@ -67,16 +84,21 @@ def members(kind: type) -> list[tuple[str, Any]]:
 
 
 def section(name: str) -> str:
-    """A name with its signature, its words and, for a class, its methods."""
-    thing = getattr(mme_vla, name)
-    called = signature(thing)
-    head = f"from mme_vla import {name}  # {thing.__module__}" + (f"\n{name}{called}" if called else "")
+    """A name with its signature, its docstring and, for a class, its methods."""
+    try:
+        thing = getattr(mme_vla, name)
+    except ImportError as error:
+        return f"### `{name}`\n\nNot described here, since the site was built without `{error.name}`."
+    called = wrapped(f"{name}{signature(thing)}") if signature(thing) else ""
+    head = f"from mme_vla import {name}  # {thing.__module__}\n{called}".rstrip()
     parts = [f"### `{name}`", f"```python\n{head}\n```", text_of(thing)]
     if inspect.isclass(thing) and not issubclass(thing, Exception):
         for method, member in members(thing):
-            bare = getattr(thing, method)
-            head = f"`.{method}`" if isinstance(member, property) else f"`.{method}{signature(bare)}`"
-            parts.append(f"**{head}**\n\n{text_of(bare)}")
+            call = "" if isinstance(member, property) else signature(getattr(thing, method))
+            parts.append(f"#### `.{method}`")
+            if call:
+                parts.append(f"```python\n{wrapped(f'{method}{call}')}\n```")
+            parts.append(text_of(getattr(thing, method)))
     return "\n\n".join(parts)
 
 
@@ -87,12 +109,10 @@ def page() -> str:
         ValueError: a public name is in no group.
     """
     named = {name for names in GROUPS.values() for name in names}
-    known = {name for name in mme_vla.__all__ if name != "__version__"}
-    rest = {name for name in known if not isinstance(getattr(mme_vla, name), Registry)}
-    if rest != named:
-        raise ValueError(f"scripts/site/api.py, GROUPS: these public names are in no group, or in one too many: {sorted(rest ^ named)}")
+    public = {name for name in mme_vla.__all__ if name != "__version__" and not name.isupper()}  # registries aside
+    if public != named:
+        raise ValueError(f"scripts/site/api_pages.py: GROUPS names other things than mme_vla: {sorted(public ^ named)}")
     parts = [INTRODUCTION.strip()]
     for title, names in GROUPS.items():
         parts += [f"## {title}", *map(section, names)]
     return "\n\n".join(parts) + "\n"
-

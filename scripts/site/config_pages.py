@@ -38,18 +38,22 @@ def code(text: str) -> str:
     return f"`{text.replace('|', chr(92) + '|')}`" if text else ""
 
 
-def section(file: Path, title: str) -> str:
-    """One file as a heading, its introduction, example commands and a table of its keys."""
+def introduction(file: Path) -> str:
+    """The comment that a file begins with: text and example commands."""
     examples, text = heading(file)
-    parts = [title, prose(text)]
-    if examples:
-        parts.append("\n".join(["```bash", *examples, "```"]))
-    rows = keys(file)
-    if rows:
-        lines = ["| key | default | |", "|---|---|---|"]
-        lines += [f"| {code(key.name)} | {code(key.default)} | {prose(key.comment)} |" for key in rows]
-        parts.append("\n".join(lines))
-    return "\n\n".join(part for part in parts if part)
+    blocks = ["\n".join(["```bash", *examples, "```"])] if examples else []
+    return "\n\n".join([*([prose(text)] if text else []), *blocks])
+
+
+def key_table(file: Path) -> str:
+    """A file's keys with their defaults and comments; empty where it has none."""
+    rows = [f"| {code(key.name)} | {code(key.default)} | {prose(key.comment)} |" for key in keys(file)]
+    return "\n".join(["| key | default | |", "|---|---|---|", *rows]) if rows else ""
+
+
+def section(file: Path, title: str) -> str:
+    """One file as a heading, its introduction and its keys."""
+    return "\n\n".join(part for part in (title, introduction(file), key_table(file)) if part)
 
 
 def groups() -> list[Path]:
@@ -59,12 +63,12 @@ def groups() -> list[Path]:
 
 def overview() -> str:
     """Introduction, and a table of the groups with their files."""
-    rows = [
-        f"| [`{group.name}`](configuration/{group.name}.md) | {' · '.join(f'`{file.stem}`' for file in files_of(group))} |"
-        for group in groups()
-    ]
+    files = {group.name: " · ".join(f"`{file.stem}`" for file in files_of(group)) for group in groups()}
+    rows = [f"| [`{name}`](configuration/{name}.md) | {stems} |" for name, stems in files.items()]
     policy = section(CONFIGS / "policy.yaml", "## `build_policy`")
-    return "\n\n".join([INTRODUCTION.strip(), "## Groups", "\n".join(["| group | files |", "|---|---|", *rows]), policy])
+    return "\n\n".join(
+        [INTRODUCTION.strip(), "## Groups", "\n".join(["| group | files |", "|---|---|", *rows]), policy]
+    )
 
 
 def files_of(group: Path) -> list[Path]:
@@ -73,7 +77,7 @@ def files_of(group: Path) -> list[Path]:
 
 def group_page(group: Path) -> str:
     """The files of a group, each with its keys."""
-    parts = [f"# Group `{group.name}`", f"`{group.name}=NAME` takes one of these files. *default* is the file's value."]
+    parts = [f"# `{group.name}`", f"`{group.name}=NAME` takes one of these files. *default* is the file's value."]
     for file in files_of(group):
         title = f"## [`{group.name}={file.stem}`](../../../configs/{group.name}/{file.name})"
         parts.append(section(file, title))

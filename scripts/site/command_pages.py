@@ -6,7 +6,7 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from importlib import import_module
 
-import configuration
+import config_pages
 
 from mme_vla.cli import COMMANDS
 from mme_vla.cli import help as cli_help
@@ -16,8 +16,8 @@ GUIDES = {
     "train": "start/getting-started.md", "evaluate": "evaluate/evaluation.md", "results": "evaluate/results.md",
     "analyse": "probe/analyses.md", "probe": "probe/probe.md", "inspect": "start/getting-started.md",
     "serve": "serve/serving.md", "harness": "serve/harness.md", "play": "evaluate/play.md", "convert": "train/data.md",
-    "exec-starts": "train/data.md", "cache": "train/data.md", "nano": "train/nano.md",
-    "vision-pretrain": "train/nano.md", "record": "benchmark/record.md", "gallery": "benchmark/gallery.md",
+    "exec-starts": "train/data.md", "cache": "train/cache.md", "nano": "train/nano.md",
+    "vision-pretrain": "train/nano.md", "record": "benchmark/record.md", "gallery": "gallery/README.md",
     "weights": "train/weights.md", "subgoal-build": "train/subgoal-training.md",
     "subgoal-train": "train/subgoal-training.md", "sample": "train/data.md", "train-tokenizer": "train/data.md",
     "docs": "extend/contributing.md",
@@ -33,7 +33,7 @@ EXAMPLES = {
     "docs": "mme-vla docs",
 }
 """An example for each command that has no YAML file."""
-WIDTH = 100
+WIDTH = 78
 """Columns of the help texts."""
 
 
@@ -64,19 +64,25 @@ def help_text(command: str) -> str:
 def page(command: str) -> str:
     """The page of one command."""
     purpose = COMMANDS[command][1]
-    guide = f"[Guide](../../{GUIDES[command]}). `--help` prints the list below."
+    guide = f"The [guide](../../{GUIDES[command]}) shows it at work."
     parts = [f"# `mme-vla {command}`", f"{purpose[0].upper()}{purpose[1:]}. {guide}"]
     stem = config_of(command)
     if stem is None:
         parts += [f"```bash\n{EXAMPLES[command]}\n```", f"## Options\n\n```text\n{help_text(command)}\n```"]
         return "\n\n".join(parts) + "\n"
-    file = configuration.CONFIGS / f"{stem}.yaml"
-    parts.append(configuration.section(file, f"## [Keys](../../../configs/{file.name})"))
+    file = config_pages.CONFIGS / f"{stem}.yaml"
+    parts += [config_pages.introduction(file), f"## Keys of [{file.name}](../../../configs/{file.name})"]
+    parts.append(config_pages.key_table(file))
     chosen = cli_help.defaults(file)
     if chosen.files:
         parts.append("Also the keys of " + ", ".join(included(name) for name in chosen.files) + ".")
-    if chosen.groups:
-        rows = [f"| {group_link(group)} | `{name}` |" for group, name in sorted(chosen.groups.items())]
+    groups = {
+        group: name
+        for stem in [*chosen.files, stem]
+        for group, name in cli_help.defaults(config_pages.CONFIGS / f"{stem}.yaml").groups.items()
+    }
+    if groups:
+        rows = [f"| {group_link(group)} | `{name}` |" for group, name in sorted(groups.items())]
         parts.append("\n".join(["## Groups", "", "| group | default |", "|---|---|", *rows]))
     return "\n\n".join(parts) + "\n"
 
