@@ -17,7 +17,7 @@ GUIDES = {
     "analyse": "probe/analyses.md", "probe": "probe/probe.md", "inspect": "start/getting-started.md",
     "serve": "serve/serving.md", "harness": "serve/harness.md", "play": "evaluate/play.md", "convert": "train/data.md",
     "exec-starts": "train/data.md", "cache": "train/cache.md", "nano": "train/nano.md",
-    "vision-pretrain": "train/nano.md", "record": "benchmark/record.md", "gallery": "gallery/README.md",
+    "vision-pretrain": "train/nano.md", "record": "benchmark/record.md", "gallery": "benchmark/gallery.md",
     "weights": "train/weights.md", "subgoal-build": "train/subgoal-training.md",
     "subgoal-train": "train/subgoal-training.md", "sample": "train/data.md", "train-tokenizer": "train/data.md",
     "docs": "extend/contributing.md",
