@@ -189,7 +189,7 @@ def integration(source: EpisodeSource) -> Figure:
             side.set_visible(False)
     panels[0].set_ylabel("this block attends to …")
     panels[-1].text(
-        1.5, 4.35, "every layer of the action expert:\ncross-attention to memory,\nthen scale and shift",
+        1.5, 5.0, "every layer of the action expert:\ncross-attention to memory,\nthen scale and shift",
         ha="center", va="center", fontsize=8, color="#1f6f8b",
     )  # fmt: skip
     return figure
