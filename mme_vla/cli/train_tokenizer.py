@@ -62,5 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "folder", nargs="?", type=Path, default=Path(), help="where to write tokenizer.model (default: here)"
     )
     path = parser.parse_args(arguments).folder / "tokenizer.model"
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(train_tokenizer(read_corpus()))
     print(f"Wrote {path} ({VOCAB_SIZE} pieces).")

@@ -29,6 +29,8 @@ FROM_ROOT = {
     "extend/contributing.md": "CONTRIBUTING.md",
 }
 """Pages that are files of the repository's root."""
+BOOST = {"concepts": 2.0, "reference": 0.5, "evidence": 0.5}
+"""Folder → weight of its pages in the search, 1 for the others."""
 LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
 
@@ -51,9 +53,10 @@ def on_files(files: Files, config: "MkDocsConfig") -> Files:
 
 
 def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
-    """Point links to files of the repository at their pages in the site; in the search, rank evidence last."""
-    if page.file.src_uri.startswith("evidence/"):
-        page.meta["search"] = {"boost": 0.5}
+    """Point links to files of the repository at their pages in the site, and rank the page in the search."""
+    folder = page.file.src_uri.partition("/")[0]
+    if folder in BOOST:
+        page.meta["search"] = {"boost": BOOST[folder]}
     return relink(page.file.src_uri, markdown)
 
 

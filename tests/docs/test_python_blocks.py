@@ -1,6 +1,7 @@
 """The Python blocks of each page run in order, in an empty folder, with what the reader has at that point."""
 
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -144,11 +145,13 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         yield ""
         return
     pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
-    process = commands.start("mme_vla.serve", "model=pi05", "backbone=tiny", "port=0", "device=cpu")
+    process = commands.start(
+        "mme_vla.serve", "model=pi05", "backbone=tiny", "port=0", "device=cpu", stderr=subprocess.STDOUT
+    )
     try:
         assert process.stdout is not None
         line = next(line for line in process.stdout if "ready at" in line)
-        yield re.findall(r":(\d+)", line)[0]
+        yield re.findall(r"ws://127.0.0.1:(\d+)", line)[0]
     finally:
         process.terminate()
         process.communicate()

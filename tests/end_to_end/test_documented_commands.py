@@ -43,6 +43,7 @@ NOT_RUN = {
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/": "needs the records of an evaluation",
     r"mme_vla\.serve ": "serves until it is stopped",
+    r"mme-vla harness ": "serves until it is stopped",
     r"mme-vla docs$": "opens a browser; tests/docs builds the site",
     r"mme_vla\.play ": "waits for a player, or plays hundreds of episodes",
     r"mme-vla record ": "records for minutes or hours",
