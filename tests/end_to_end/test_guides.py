@@ -92,7 +92,7 @@ def test_published_numbers_of_the_comparison_are_the_papers() -> None:
 
 
 @pytest.mark.slow
-def test_the_figures_are_drawn_from_the_sample(tmp_path: Path) -> None:
+def test_the_figures_come_from_the_sample(tmp_path: Path) -> None:
     command = [sys.executable, str(REPOSITORY / "scripts" / "figures.py"), "--output", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
