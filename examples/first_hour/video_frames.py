@@ -16,12 +16,12 @@ class VideoFrames(PerceptualMemory):
         super().__init__(d_vision, width, budget, StorageSpec(grid))
         self.frames = budget // grid**2
 
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def frames_at(self, step: int, exec_start: int) -> np.ndarray:
         last = min(step, max(exec_start - 1, 0))
         return np.unique(np.linspace(0, last, self.frames).astype(np.int64))
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return all_patches(self.chosen(step, history.exec_start), self.storage.grid)
+        return all_patches(self.frames_at(step, history.exec_start), self.storage.grid)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return np.unique(np.concatenate([self.chosen(int(step), exec_start) for step in steps]))
+        return np.unique(np.concatenate([self.frames_at(int(step), exec_start) for step in steps]))
