@@ -102,5 +102,12 @@ def group_link(group: str) -> str:
 
 
 def pages() -> dict[str, str]:
-    """Path under `docs/` → Markdown, for every command."""
+    """Path under `docs/` → Markdown, for every command.
+
+    Raises:
+        ValueError: a command has no guide, or no example.
+    """
+    examples = EXAMPLES.keys() | filter(config_of, COMMANDS)
+    if missing := COMMANDS.keys() - (GUIDES.keys() & examples):
+        raise ValueError(f"scripts/site/command_pages.py: no entry in GUIDES or EXAMPLES for {sorted(missing)}")
     return {f"reference/commands/{command}.md": page(command) for command in COMMANDS}

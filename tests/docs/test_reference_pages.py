@@ -89,6 +89,12 @@ def test_each_command_has_a_page_with_its_options() -> None:
         assert "```bash" in page, f"{command} has no example"
 
 
+def test_a_command_without_a_guide_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(command_pages.COMMANDS, "dance", ("dance", "dance"))
+    with pytest.raises(ValueError, match="dance"):
+        command_pages.pages()
+
+
 def test_a_command_without_its_extra_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "mme_vla.serving.harness", raising=False)
     monkeypatch.setitem(sys.modules, "vla_eval.specs", None)  # importing it raises ImportError
