@@ -75,11 +75,7 @@ class MMEModel(nn.Module):
 
     @torch.no_grad()
     def sample(
-        self,
-        batch: Batch,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-        memory: MemoryTokens | None = None,
+        self, batch: Batch, noise: Mapping[str, Tensor], steps: int | None = None, memory: MemoryTokens | None = None
     ) -> Tensor:
         """A normalised chunk [b, h, a].
 

@@ -100,11 +100,7 @@ INTEGRATIONS: Registry[Any] = Registry(
 )
 BACKBONES: Registry[Any] = Registry(
     "backbone",
-    {
-        "pi05": "mme_vla.backbone.pi05",
-        "nano": "mme_vla.backbone.nano",
-        "openvla": "mme_vla.methods.openvla_oft.model",
-    },
+    {"pi05": "mme_vla.backbone.pi05", "nano": "mme_vla.backbone.nano", "openvla": "mme_vla.methods.openvla_oft.model"},
 )
 HEADS: Registry[Any] = Registry("flow head", dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"))
 POLICIES: Registry[Any] = Registry(

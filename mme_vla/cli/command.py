@@ -129,11 +129,7 @@ def known_keys(config_name: str, tree: Path) -> list[str]:
 
 
 def check_overrides(
-    config_name: str,
-    overrides: Sequence[str],
-    *,
-    directory: Path | None = None,
-    extra_dirs: Sequence[Path] = (),
+    config_name: str, overrides: Sequence[str], *, directory: Path | None = None, extra_dirs: Sequence[Path] = ()
 ) -> None:
     """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included."""
     columns = [_choices(override) for override in parse(overrides)]

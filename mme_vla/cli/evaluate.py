@@ -115,10 +115,7 @@ def choose_device(name: str) -> "torch.device":
 
 
 def choose_subgoals(
-    policy: "Policy",
-    section: dict[str, Any] | None,
-    mode: str = "inline",
-    device: "torch.device | None" = None,
+    policy: "Policy", section: dict[str, Any] | None, mode: str = "inline", device: "torch.device | None" = None
 ) -> "SubgoalPredictor | None":
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
 

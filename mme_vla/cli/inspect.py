@@ -162,13 +162,7 @@ def build_memory(cfg: DictConfig) -> "Memory":
 
 
 def draw_memory(
-    source: "EpisodeSource",
-    episode: int,
-    step: int,
-    memory: "Memory",
-    name: str,
-    folder: Path,
-    console: "Console",
+    source: "EpisodeSource", episode: int, step: int, memory: "Memory", name: str, folder: Path, console: "Console"
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
     from mme_vla.data.memory_image import memory_sheet

@@ -44,11 +44,7 @@ DEMO = (
 )
 
 
-EXAMPLES = (
-    "outputs/evaluation --html report.html",
-    "runs/a runs/b --compare framesamp_modul pi05",
-    "--demo --brief",
-)
+EXAMPLES = ("outputs/evaluation --html report.html", "runs/a runs/b --compare framesamp_modul pi05", "--demo --brief")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

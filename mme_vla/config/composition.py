@@ -94,11 +94,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 
 def compose(
-    config_name: str,
-    overrides: Sequence[str] = (),
-    *,
-    directory: Path | None = None,
-    extra_dirs: Sequence[Path] = (),
+    config_name: str, overrides: Sequence[str] = (), *, directory: Path | None = None, extra_dirs: Sequence[Path] = ()
 ) -> DictConfig:
     """Compose `config_name` under Hydra's override grammar; also from inside a running Hydra command.
 

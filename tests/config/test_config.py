@@ -65,10 +65,7 @@ def test_a_model_defines_its_memory(tree: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        (
-            "model=tokendrp_expert",
-            "Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'? Known: small,",
-        ),
+        ("model=tokendrp_expert", "Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'? Known: small,"),
         ("train.lrr=1", "Unknown config key 'train.lrr'. In 'train': Did you mean 'lr'? Known: clip, lr, note, steps."),
         ("~train.lrr", "Did you mean 'lr'?"),
         ("lr=1", "Unknown config key 'lr'. Did you mean 'train.lr'?"),
