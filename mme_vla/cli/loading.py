@@ -49,6 +49,7 @@ def load_policy(
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.run_folders import locate_checkpoint
+    from mme_vla.processing.normalise import NormStats
 
     device = find_device(cfg.device) if device is None else device
     named = words_of(*_MODEL_KEYS)
@@ -66,12 +67,11 @@ def load_policy(
         raise UserError(
             f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out."
         )
-    from mme_vla.testing.small import unit_stats
-
     if cfg.dtype not in ("auto", "float32"):
         raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
-    policy.require_processor().stats = unit_stats(policy.embodiment)
+    robot = policy.embodiment
+    policy.require_processor().stats = NormStats.unit(robot.state.width, robot.action.width)
     logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
     return LoadedPolicy(policy, str(cfg.name), None)
 

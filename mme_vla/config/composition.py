@@ -21,7 +21,8 @@ from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
 from mme_vla.config import plugins
 from mme_vla.config.naming import (
@@ -116,6 +117,7 @@ def compose(
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
+    join_plugins(cfg, config_name, trees, words)
     if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
         cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
@@ -138,6 +140,26 @@ def command_trees() -> tuple[Path, ...]:
 
 
 OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
+
+
+def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overrides: Sequence[str]) -> None:
+    """Have `plugins` name the modules of every file that takes part; Hydra itself keeps the last file's list.
+
+    A list on the command line counts alone. The library's own files name no plugins.
+
+    Args:
+        trees: folders of YAML files, the library's first. overrides: those of the composition.
+    """
+    if not trees[1:] or any(word.lstrip("+").startswith("plugins=") for word in overrides):
+        return
+    with local_hydra(trees[0], trees[1:]) as engine:
+        loader = engine.config_loader
+        parts = loader.compute_defaults_list(config_name, list(overrides), RunMode.RUN).defaults
+        loaded = [loader.repository.load_config(part.config_path) for part in parts if not part.package]  # type: ignore
+        lists = [plugins.plugins_of(part.config, part.path) for part in loaded if part is not None]
+    if names := list(dict.fromkeys(name for names in lists for name in names)):
+        with open_dict(cfg):
+            cfg.plugins = names
 
 
 def import_plugins(cfg: DictConfig) -> None:

@@ -81,6 +81,15 @@ class NormStats:
     state: QuantileStats
     actions: QuantileStats
 
+    @classmethod
+    def unit(cls, state_width: int, action_width: int) -> Self:
+        """Statistics that leave numbers about as they are: −1 and 1 stay."""
+        sides = []
+        for width in (state_width, action_width):
+            ones = np.ones(width)
+            sides.append(QuantileStats(0 * ones, ones.copy(), -ones, ones, -ones, ones))
+        return cls(*sides)
+
     def to_dict(self) -> dict[str, Any]:
         """Return the layout of openpi's `norm_stats.json`."""
         return {"norm_stats": {"state": self.state.to_dict(), "actions": self.actions.to_dict()}}
