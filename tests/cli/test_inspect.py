@@ -69,12 +69,6 @@ def test_remembered_patches_keep_their_colour_and_others_are_dimmed() -> None:
     assert outside[0] > 150
 
 
-def test_more_frames_than_fit_are_counted() -> None:
-    frames = np.zeros((80, 16, 16, 3), np.uint8)
-    selected = np.array([[frame, 0] for frame in range(80)])
-    assert memory_sheet(frames, selected, 2, 0, 79, "t" * 500).height < 2000
-
-
 def test_a_checkpoint_shows_its_parts(tmp_path: Path, console: Console) -> None:
     policy = build_policy("framesamp_modul", memory={"budget": 64})
     policy.save_pretrained(tmp_path)

@@ -12,9 +12,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from helpers import commands
-from mme_vla.cli.command import check_overrides, cli, options_first
-from mme_vla.config.composition import compose, config_dir, import_plugins, true_name
-from mme_vla.config.naming import join_memories
+from mme_vla.cli.command import check_overrides, options_first
+from mme_vla.config.composition import compose, import_plugins
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
@@ -56,12 +55,6 @@ def tree(tmp_path: Path) -> Path:
     return write_tree(tmp_path / "tree", TREE)
 
 
-def test_a_model_defines_its_memory(tree: Path) -> None:
-    cfg = compose("demo", ["model=tokendrop_expert", "train.lr=1e-4"], directory=tree)
-    assert (cfg.name, cfg.memory.budget, cfg.train.lr) == ("tokendrop_expert", 512, 1e-4)
-    assert "hydra" not in cfg
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -94,11 +87,6 @@ def test_a_mistake_is_answered_with_the_near_names(tree: Path, override: str, me
 def test_a_memory_without_a_name_is_reported(words: list[str]) -> None:
     with pytest.raises(UserError, match="`memory` has no name, only budget"):
         compose("train", words)
-
-
-@pytest.mark.parametrize("override", ["train.note=text", "train.lr=2", "train.clip=null", "+train.x=1", "seed=${fast}"])
-def test_a_fitting_value_passes(tree: Path, override: str) -> None:
-    compose("demo", [override], directory=tree)
 
 
 def test_a_broken_file_and_a_missing_folder_are_named(tree: Path) -> None:
@@ -194,18 +182,6 @@ def test_every_model_of_the_library_composes(model: str) -> None:
     assert compose("policy", [f"model={model}"]).name == model
 
 
-@pytest.mark.parametrize("model", MODELS[::6])
-def test_a_models_name_is_the_one_that_comparing_all_models_would_find(model: str) -> None:
-    cfg = compose("train", [f"model={model}", "train.steps=2"])
-    assert true_name(join_memories(cfg.copy()), "train", (config_dir().resolve(),)) == model
-
-
-def test_a_misspelt_model_of_the_library_is_answered() -> None:
-    with pytest.raises(UserError, match="Did you mean 'tokendrop_expert'"):
-        compose("policy", ["model=tokendrp_expert"])
-    assert (config_dir() / "model").is_dir()
-
-
 APP = """
     from pathlib import Path
     from mme_vla.cli.command import cli
@@ -234,22 +210,6 @@ def app(tree: Path, tmp_path: Path) -> Path:
 
 def run(app: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return commands.run(str(app), *arguments, cwd=app.parent)
-
-
-@pytest.mark.slow
-def test_a_command_runs_with_hydras_run_folder(app: Path) -> None:
-    done = run(app, "model=tokendrop_expert", "hydra.run.dir=here")
-    assert done.stdout == "ran tokendrop_expert 512 0.001 app\n", done.stderr
-    assert (app.parent / "here" / ".hydra" / "config.yaml").is_file()
-
-
-@pytest.mark.slow
-def test_a_mistyped_command_ends_before_it_starts(app: Path) -> None:
-    done = run(app, "model=tokendrp_expert")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("Error: Unknown model 'tokendrp_expert'. Did you mean 'tokendrop_expert'?")
-    assert "Traceback" not in done.stderr
-    assert not (app.parent / "outputs").exists()
 
 
 @pytest.mark.slow
@@ -287,11 +247,3 @@ def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     wrong = run(app, "--config-dir", "nowhere")
     assert wrong.returncode == 2
     assert "nowhere' does not exist" in wrong.stderr
-
-
-def test_a_command_can_be_called_with_a_config() -> None:
-    @cli("demo")
-    def double(cfg: dict) -> int:
-        return 2 * cfg["x"]
-
-    assert double({"x": 4}) == 8

@@ -81,12 +81,6 @@ def test_a_secret_is_not_reported() -> None:
     assert "5317" not in str(error.value)
 
 
-def test_keys_of_other_purposes_are_left_aside_only_where_they_may_be() -> None:
-    assert read_section(Inner, {"width": 1, "model": "x"}, others=True) == Inner(1)
-    with pytest.raises(UserError, match="Unknown key model"):
-        read_section(Inner, {"width": 1, "model": "x"})
-
-
 def test_commands_read_their_settings_with_it() -> None:
     with pytest.raises(UserError, match=r"train\.keep\.last='two' must be a whole number"):
         TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1, "keep": {"last": "two"}})

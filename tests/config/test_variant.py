@@ -94,11 +94,6 @@ def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path
     ], done.stderr
 
 
-def test_from_python_the_policy_and_its_card_have_the_true_name(tmp_path: Path) -> None:
-    policy = build_policy("tokendrop_expert", memory="framesamp", integration="modulator", device="meta")
-    assert policy.config["name"] == "framesamp_modul"
-
-
 def test_the_digest_tells_compositions_apart_and_nothing_else() -> None:
     config = json.loads(json.dumps(build_policy("framesamp_modul", device="meta").config))
     digest = composition_digest(config)

@@ -130,18 +130,6 @@ def test_a_damaged_claim_is_named(content: str, tmp_path: Path, monkeypatch: pyt
             read()
 
 
-def test_a_folder_in_place_of_a_claim_is_named(tmp_path: Path) -> None:
-    (tmp_path / "claims" / "BinFill-0.0.json").mkdir(parents=True)
-    with pytest.raises(UserError, match=r"BinFill-0\.0\.json is damaged"):
-        Claims(tmp_path, "episodes-0of2.jsonl")
-
-
-def test_claims_of_earlier_versions_are_ignored(tmp_path: Path) -> None:
-    (tmp_path / "claims.jsonl").write_text("anything")
-    with RecordLog(tmp_path / "episodes-0of2.jsonl"):
-        assert taken(Claims(tmp_path, "episodes-0of2.jsonl").take(JOBS)) == 0
-
-
 def test_episodes_that_took_longest_begin_first() -> None:
     durations = Durations([record(0, 1), record(1, 4), record(0, 8, task="PickXtimes")])
     jobs = [*JOBS[:3], Job("PickXtimes", "test", 5), Job("StopCube", "test", 0)]

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
-from helpers.scripted_env import VIDEO, make_scripted_env
+from helpers.scripted_env import VIDEO
 from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
-from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
@@ -130,11 +129,6 @@ def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:
         roll(quick_policy("framesamp_modul", patch_size=8, memory={"budget": 64}), JOBS[:1], envs)
 
 
-def test_what_is_rendered_is_a_choice_of_two() -> None:
-    with pytest.raises(UserError, match=r"draw='need'.*needed"):
-        RolloutSettings(draw="need")
-
-
 def test_acting_on_a_frame_that_was_not_rendered_is_refused() -> None:
     policy = quick_policy("pi05")
     episode = policy.start_episode("pick up the cube")
@@ -144,7 +138,3 @@ def test_acting_on_a_frame_that_was_not_rendered_is_refused() -> None:
     assert episode.n_observed_frames == 3
     with pytest.raises(UserError, match="current frame was not rendered"):
         policy.act(episode)
-
-
-def test_an_environment_that_draws_everything_gives_the_same_results() -> None:
-    both_ways(quick_policy("ttt_modul", patch_size=8), base=make_scripted_env)

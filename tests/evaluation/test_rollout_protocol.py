@@ -49,13 +49,6 @@ def test_sixteen_of_twenty_actions_are_executed_and_then_the_policy_is_queried_a
     assert (record.outcome, record.steps, record.extra["chunks"]) == ("timeout", 41, 3)
 
 
-def test_another_number_of_actions_can_be_executed(memoryless, monkeypatch):
-    watched, envs = Watched(memoryless, monkeypatch), InlineEnvs()
-    roll(memoryless, [UNMASK], envs, execute=5)
-    sent = np.concatenate([chunk[:5] for chunk in watched.chunks])
-    assert np.array_equal(np.stack(envs.made[UNMASK].actions), sent[:41])
-
-
 def test_an_episode_that_ends_inside_a_chunk_ends_there(memoryless):
     envs = InlineEnvs(base=make_moving_env)
     (record,) = roll(memoryless, [UNMASK], envs)
@@ -141,13 +134,6 @@ def test_the_oracles_subgoal_is_that_of_the_current_frame(model, texts, monkeypa
         assert torch.equal(prompt, policy.processor.prompt("pick up the red cube", subgoal=text)[0])
 
 
-def test_without_a_subgoal_the_prompt_is_the_goal_prompt(monkeypatch):
-    policy = quick_policy("simplesg")
-    watched = Watched(policy, monkeypatch, lambda e: e.prompt[0])
-    roll(policy, [UNMASK], InlineEnvs())
-    assert torch.equal(watched.observed[0], policy.processor.prompt("pick up the red cube", subgoal=None)[0])
-
-
 def test_whoever_is_ready_travels_in_one_batch(memoryless, monkeypatch):
     watched = Watched(memoryless, monkeypatch)
     roll(memoryless, JOBS, InlineEnvs(workers=6))
@@ -178,12 +164,6 @@ def test_batches_change_rounding_alone(memoryless):
     for job in JOBS:
         first, second = alone.made[job].actions, together.made[job].actions
         assert np.abs(np.stack(first) - np.stack(second)).max() < 1e-4
-
-
-def test_noise_depends_on_seed_task_and_episode():
-    seeds = {episode_seed(seed, task, number) for seed in (7, 42) for task in ("A", "B") for number in range(3)}
-    assert len(seeds) == 12 and all(0 <= seed < 2**63 for seed in seeds)
-    assert episode_seed(7, "A", 1) == episode_seed(7, "A", 1)
 
 
 def test_actions_that_are_no_numbers_end_the_episode_alone(memoryless, monkeypatch):
