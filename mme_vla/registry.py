@@ -153,9 +153,6 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
             `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
 
-    Raises:
-        UserError: an unknown kind, or the name is taken.
-
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...
     """

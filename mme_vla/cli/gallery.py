@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
 COLUMNS = 4  # images a row
-EVERY = 8
-"""Steps between two images that are taken; which of them are shown is decided at the end."""
+EVERY = 8  # Steps between two images that are taken; which of them are shown is decided at the end
 
 
 @dataclass(frozen=True)

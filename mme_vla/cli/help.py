@@ -132,8 +132,7 @@ OPTIONS = (
     ("--config-dir DIR", "search YAML files of your own too"),
     ("--multirun", "run once for each of several choices: model=framesamp_modul,tokendrop_modul"),
 )
-WIDEST, UNKNOWN_WIDTH = 120, 100
-"""Columns at most; columns where there is no terminal."""
+WIDEST, UNKNOWN_WIDTH = 120, 100  # Columns at most; columns where there is no terminal
 SelectGroups = Callable[[Sequence[str]], dict[str, str]]
 """From the words of a command line to the file that each group then takes."""
 

@@ -142,8 +142,9 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
 
 def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
     """The episode and step asked for; the last step by default."""
-    if not isinstance(episode, int) or not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    from mme_vla.evaluation.analyses.replay import check_episode
+
+    check_episode(source, episode)
     length = int(source.lengths[episode])
     step = length - 1 if step is None else step
     if not isinstance(step, int) or not 0 <= step < length:

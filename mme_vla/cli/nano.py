@@ -1,6 +1,5 @@
 """`python -m mme_vla.nano task=VideoUnmask model=framesamp_modul`: from nothing to a page of results on two cores."""
 
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,10 +9,10 @@ from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
-from mme_vla.config.composition import command_trees, config_dir
+from mme_vla.config.composition import command_trees, config_dir, plain
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.utils import read_json, write_json
 
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from mme_vla.evaluation.records import EpisodeRecord
     from mme_vla.nano.demonstrations import Scene
 
-# Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 SEEDS_APART = 100_000  # first seeds of two difficulties
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
 
@@ -56,12 +53,11 @@ def command(cfg: DictConfig) -> None:
     """Record, train, evaluate and write the page, each as far as it is not there."""
     from mme_vla.envs.make import check_names, require_simulator
 
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
+    config = plain(cfg)
     check_names(config["task"], "mme_vla", "waypoint", None, None)
     check_counts(config["demonstrations"])
     require_simulator()
-    run({str(key): value for key, value in config.items()}, command_trees()[1:])
+    run(config, command_trees()[1:])
 
 
 def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:

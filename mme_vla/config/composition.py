@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra import version
@@ -160,6 +161,11 @@ def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overr
     if names := list(dict.fromkeys(name for names in lists for name in names)):
         with open_dict(cfg):
             cfg.plugins = names
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """A configuration as resolved plain values."""
+    return {str(key): value for key, value in OmegaConf.to_container(cfg, resolve=True).items()}  # type: ignore[union-attr]
 
 
 def import_plugins(cfg: DictConfig) -> None:

@@ -31,11 +31,6 @@ class Feed:
     stills: int = 0
     at: int = 0
 
-    def __post_init__(self) -> None:
-        for name in ("sessions", "stills", "at"):
-            if getattr(self, name) < 0:
-                raise UserError(f"A probe cannot show {getattr(self, name)} {name}: the number must not be negative.")
-
     def repeats(self, frames: np.ndarray, exec_start: int) -> np.ndarray:
         """How often each of the episode's frames [n] is observed, int64 [n]."""
         shown = np.where((frames < exec_start) & (not self.video), 0, 1)

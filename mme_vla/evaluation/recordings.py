@@ -12,8 +12,7 @@ from mme_vla.memory.base import frames_scored, past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import frames_read
 
-SUBGOAL = "simple_subgoal"
-"""The column whose changes separate sub-tasks."""
+SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.composition import compose, import_plugins, plain
 from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import Demonstration
@@ -27,8 +27,7 @@ from mme_vla.training.settings import TrainSettings
 from mme_vla.utils import read_lines, write_json
 
 DONE = "trained.json"
-HELD_OUT = 10
-"""One demonstration in so many only measures the loss."""
+HELD_OUT = 10  # One demonstration in so many only measures the loss
 
 
 def compose_policy(
@@ -51,9 +50,7 @@ def compose_policy(
     composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
     import_plugins(composed)
-    config = OmegaConf.to_container(composed, resolve=True)
-    assert isinstance(config, dict)
-    return {str(key): value for key, value in config.items()}
+    return plain(composed)
 
 
 def build(config: Mapping[str, Any]) -> MMEPolicy:

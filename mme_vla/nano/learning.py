@@ -27,8 +27,7 @@ NARROWEST = 0.1  # of an action's number, in metres or radians: less than that i
 
 _PAST = "history."
 JOINT_NOISE = 0.05
-MIN_DISTANCE = 0.05
-"""Metres above the table from where on a motion is one to another place."""
+MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
 
 
 class SparseHistory(History):

@@ -23,8 +23,7 @@ _BY_NAME = {
     "container": "container", "button": "button", "target": "target", "spot": "target", "disc": "disc",
     "board": "box", "box": "box", "obstacle": "obstacle", "peg": "peg",
 }  # fmt: skip
-LABEL_SIDE = 64
-"""Labels have a number for each of 64×64 places of an image."""
+LABEL_SIDE = 64  # Labels have a number for each of 64×64 places of an image
 _CUBES = ("red cube", "green cube", "blue cube")
 _CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out where it has one
 

@@ -1,11 +1,13 @@
 """Arms of a probe: interventions alone or together (`drop:2`, `nodemo+shuffle`)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, is_dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief
 from mme_vla.evaluation.feed import Feed
 from mme_vla.policy.base import Policy
@@ -30,10 +32,7 @@ class Arm:
     @property
     def feed(self) -> Feed:
         """What the policy observes."""
-        feed = Feed()
-        for part in self.parts:
-            feed = part.feed(feed)
-        return feed
+        return reduce(lambda feed, part: part.feed(feed), self.parts, Feed())
 
     @property
     def needs(self) -> frozenset[str]:
@@ -49,24 +48,18 @@ class Arm:
         allowed = [frames for part in self.parts if (frames := part.only(moment)) is not None]
         if not allowed:
             return None
-        both = allowed[0]
-        for frames in allowed[1:]:
-            both = np.intersect1d(both, frames)
+        both: np.ndarray = reduce(np.intersect1d, allowed)
         if not len(both):
             raise UserError(f"{self.name} leaves no frame to remember: its parts allow different ones.")
         return both
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         """What is remembered instead."""
-        for part in self.parts:
-            store = part.edit(store, moment)
-        return store
+        return reduce(lambda edited, part: part.edit(edited, moment), self.parts, store)
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         """The subgoal that the policy reads instead."""
-        for part in self.parts:
-            subgoal = part.say(subgoal, moment)
-        return subgoal
+        return reduce(lambda said, part: part.say(said, moment), self.parts, subgoal)
 
     def dial(self) -> float | None:
         """Where the arm stands on its dial, if it is one intervention with a number for one."""
@@ -82,9 +75,8 @@ UNPROBED = Arm("unprobed")
 def read_arm(spec: Any) -> Arm:
     """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`."""
     if isinstance(spec, Mapping):
-        part: Intervention = INTERVENTIONS.build(spec)
         options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
-        return Arm(f"{spec['name']}({options})" if options else str(spec["name"]), (part,))
+        return Arm(f"{spec.get('name')}({options})" if options else str(spec.get("name")), (_build(spec),))
     if not isinstance(spec, str) or not spec:
         raise UserError(f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop, …}}.")
     return Arm(spec, tuple(_read_part(word) for word in spec.split("+")))
@@ -92,17 +84,20 @@ def read_arm(spec: Any) -> Arm:
 
 def _read_part(word: str) -> Intervention:
     name, _, value = word.partition(":")
-    entry = INTERVENTIONS[name]
+    dial = INTERVENTIONS[name].dial
     if not value:
-        built: Intervention = INTERVENTIONS.build({"name": name})
-        return built
-    if entry.dial is None:
-        raise UserError(f"{word!r}: the intervention {name} has no dial; write {name}.")
-    number = value.removeprefix("-")
-    if value != "all" and not number.isdecimal():
-        raise UserError(f"{word!r}: the dial {entry.dial} of {name} is a whole number, or all where it counts.")
-    made: Intervention = INTERVENTIONS.build({"name": name, entry.dial: None if value == "all" else int(value)})
-    return made
+        return _build({"name": name})
+    if dial is None or (value != "all" and not value.removeprefix("-").isdecimal()):
+        allowed = f"{name}:<{dial}>, a whole number, or all where it counts" if dial else f"{name}, which has no dial"
+        raise UserError(f"{word!r}: write {allowed}.")
+    return _build({"name": name, dial: None if value == "all" else int(value)})
+
+
+def _build(section: Mapping[str, Any]) -> Intervention:
+    entry = INTERVENTIONS[section.get("name")]  # type: ignore[index]
+    options = {key: value for key, value in section.items() if key != "name"}
+    built: Intervention = read_section(entry, options, section["name"]) if is_dataclass(entry) else entry(**options)
+    return built
 
 
 def read_arms(specs: Any) -> list[Arm]:
@@ -157,11 +152,7 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
-    options: list[dict[str, Any]] = []
-    for part in arm.parts:
-        names: list[str] = [option.name for option in fields(part)] if is_dataclass(part) else []
-        options.append({"intervention": type(part).__name__, **{name: getattr(part, name) for name in names}})
-    return options
+    return [{"intervention": type(part).__name__, **vars(part)} for part in arm.parts]
 
 
 def slug(name: str) -> str:

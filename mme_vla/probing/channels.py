@@ -80,8 +80,7 @@ def same_progress(slots: Sequence[int], count: int) -> np.ndarray:
     return np.linspace(0, max(count - 1, 0), max(len(slots), 1)).round().astype(int)[: len(slots)]
 
 
-Place = tuple[History, int]
-"""A frame of a history."""
+Place = tuple[History, int]  # A frame of a history
 
 
 class OnlyFrames(History):
@@ -157,10 +156,8 @@ class Channel:
     """One way to what a policy remembers. `clock`: what the times of its entries count; None where they have none."""
 
     clock: str | None = "frames"
-    sees_pauses = True
-    """Whether frames at which nothing is decided reach this memory."""
-    chooses = True
-    """Whether the memory chooses among frames, so that it can be given fewer."""
+    sees_pauses = True  # Whether frames at which nothing is decided reach this memory
+    chooses = True  # Whether the memory chooses among frames, so that it can be given fewer
 
     def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
         """What is remembered at `step` (by default now), choosing among the frames `only` where they are given."""

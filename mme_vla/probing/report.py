@@ -31,8 +31,7 @@ MEASURES = {
     "interference": ("distract:1", "one unrelated episode first"),
 }
 """What a probe's table has one column for: the arm that measures it, and what that does."""
-AGES = (0, 16, 32, 64, 128, 256, 512)
-"""Where the bins of an entry's age begin, in frames."""
+AGES = (0, 16, 32, 64, 128, 256, 512)  # Where the bins of an entry's age begin, in frames
 
 
 @dataclass(frozen=True)

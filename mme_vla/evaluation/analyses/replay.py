@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +20,13 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.prompt import SubgoalText
 
-STRIDE = 16
-"""Steps between two chunks, as an evaluation executes them."""
+STRIDE = 16  # Steps between two chunks, as an evaluation executes them
+
+
+def check_episode(source: EpisodeSource, episode: Any) -> None:
+    """Refuse an episode that a dataset does not have."""
+    if not isinstance(episode, int) or not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
 
 
 def replay(
@@ -37,8 +43,7 @@ def replay(
     Yields:
         The step a chunk was just chosen at, and the running episode.
     """
-    if not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    check_episode(source, episode)
     give_statistics(policy, source)
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     steps = np.arange(start, length, stride)
@@ -174,10 +179,7 @@ def selection_sheets(
     Yields:
         (step, image); images grow with what is remembered.
     """
-    import torch
-
-    if not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    check_episode(source, episode)
     if every < 1:
         raise UserError(f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])

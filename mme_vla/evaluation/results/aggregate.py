@@ -29,8 +29,7 @@ from mme_vla.evaluation.results.scopes import (
     tasks_of,
 )
 
-Outcomes = np.ndarray
-"""Successes [episodes, runs]: every run on the same episodes."""
+Outcomes = np.ndarray  # Successes [episodes, runs]: every run on the same episodes
 
 
 class Interval(NamedTuple):
@@ -42,8 +41,6 @@ class Interval(NamedTuple):
 
 def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
     """Mean and sample standard deviation (divisor n − 1), as the released aggregation; one value has none."""
-    if not values:
-        raise ValueError("mean_std() needs at least one value.")
     array = np.asarray(values, np.float64)
     return float(array.mean()), float(array.std(ddof=1)) if len(array) > 1 else None
 

@@ -30,8 +30,7 @@ class Point:
         return 100 * self.won / self.episodes
 
 
-Curves = dict[tuple[str, str, str], list[Point]]
-"""(model, task, dial) → points, ascending."""
+Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → points, ascending
 
 
 def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
@@ -98,8 +97,7 @@ def stress_figures(curves: Curves) -> dict[str, str]:
     return figures
 
 
-EXTRA = "process"
-"""Where a record keeps it."""
+EXTRA = "process"  # Where a record keeps it
 CAPTION = (
     "Progress: sub-tasks done, of those there are. Then how many episodes ended by a wrong choice that is a mistake of "
     "memory (which one, where, how many, in what order, how), by another wrong one, or with the time run out."

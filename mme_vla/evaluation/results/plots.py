@@ -20,8 +20,7 @@ FAMILIES = {"none": "#7a8b99", "symbolic": "#b8972f", "perceptual": "#1f6f8b", "
             "prior": "#b5523b"}  # fmt: skip
 INK, FAINT = "#2b2d42", "#8d99ae"
 MOST_BARS = 8
-SWEPT = ("framesamp_modul", "tokendrop_modul")
-"""Models whose memory budget the paper varies."""
+SWEPT = ("framesamp_modul", "tokendrop_modul")  # Models whose memory budget the paper varies
 _STYLE = {
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 10, "axes.edgecolor": FAINT,
     "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK, "axes.spines.top": False,

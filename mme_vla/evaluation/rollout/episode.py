@@ -46,8 +46,7 @@ class RunningEpisode:
         self._policy, self._subgoals, self._piece = policy, subgoals, piece
         self.job, self.trace = job, trace
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
-        self.watched: Any = None
-        """What the subgoal predictor knows of the episode."""
+        self.watched: Any = None  # What the subgoal predictor knows of the episode
         self.worker = -1
         self.steps = self.chunks = 0
         self.video_frames = 0

@@ -21,6 +21,7 @@ from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
+from mme_vla.policy.saving import composition_digest
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
@@ -112,9 +113,6 @@ def evaluate(
         notes: kept in `run.json` and never compared.
         times_from: earlier records, of any policy: the longest episodes begin first, and say how long all will take;
             by default those in `output` and in the folders beside it.
-
-    Raises:
-        UserError: `output` holds another run, or the environments cannot be built.
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
@@ -138,7 +136,12 @@ def evaluate(
                 progress.say(str(forecast))
             waiting = Waiting(missing, Claims(output, shard.file) if shard.count > 1 else None)
             envs = _environments(policy, output, settings, base, workers) if missing else None
-            workload = _run(policy, waiting, envs, output, facts, settings, subgoals, log, progress)
+            workload = Workload()
+            if envs is not None:
+                folder = output / SUBGOALS if settings.subgoal_log else None
+                with envs:
+                    rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress, workload)
+                    rollout.run(waiting)
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
@@ -159,26 +162,6 @@ def _environments(
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
     return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)
-
-
-def _run(
-    policy: Policy,
-    waiting: Waiting,
-    environments: VecEnv | None,
-    output: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    subgoals: SubgoalPredictor | None,
-    log: RecordLog,
-    progress: RolloutProgress,
-) -> Workload:
-    if environments is None:
-        return Workload()
-    with environments as envs:
-        folder = output / SUBGOALS if settings.subgoal_log else None
-        rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress)
-        rollout.run(waiting)
-    return rollout.workload
 
 
 def run_settings(
@@ -239,6 +222,20 @@ def checkpoint_label(source: str | None) -> int | str:
     name = Path(source).name
     step = re.search(r"(?:^|[_-])(\d+)$", name)
     return int(step[1]) if step else name
+
+
+def facts_of(
+    policy: Policy, name: str | None, source: str | None, settings: RolloutSettings, subgoal: str | None
+) -> RunFacts:
+    """What the records of a run have in common.
+
+    Args:
+        name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the predictor.
+    """
+    return RunFacts(
+        name or str(policy.config.get("name", "policy")), checkpoint_label(source), settings.seed, settings.split,
+        settings.max_steps, subgoal, memory_budget(policy), composition_digest(policy.config),
+    )  # fmt: skip
 
 
 def memory_budget(policy: Policy) -> int | None:

@@ -18,8 +18,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
-EVERY = range(2**31)
-"""Whatever frames there are."""
+EVERY = range(2**31)  # Whatever frames there are
 LONGEST_VIDEO = 10_000  # frames
 
 

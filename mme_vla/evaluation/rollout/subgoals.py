@@ -20,8 +20,7 @@ from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.subgoal.text import mark_points
 
-EXTRA = "subgoals"
-"""Where a record keeps its score, in `EpisodeRecord.extra`."""
+EXTRA = "subgoals"  # Where a record keeps its score, in `EpisodeRecord.extra`
 
 
 @dataclass
@@ -145,8 +144,7 @@ def _normalised(words: str) -> str:
     return " ".join(words.lower().split()).rstrip(".")
 
 
-SUBGOALS = "subgoals"
-"""Name of the folder within a run."""
+SUBGOALS = "subgoals"  # Name of the folder within a run
 
 
 class SubgoalTrace:

@@ -11,9 +11,7 @@ import numpy as np
 from mme_vla.utils import draft_of
 from mme_vla.utils.media import VideoWriter, video_frame
 
-SAVE_ON = ("none", "all", "success", "failure")
-BEHIND = 64
-"""Frames that may wait to be compressed."""
+BEHIND = 64  # Frames that may wait to be compressed
 _LONGEST_GOAL = 100  # characters of a file name
 
 
