@@ -8,6 +8,12 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what to do."""
 
 
+def require(holds: object, message: str) -> None:
+    """Raise a `UserError` with this message unless something holds."""
+    if not holds:
+        raise UserError(message)
+
+
 def did_you_mean(name: str, options: Iterable[str]) -> str:
     """Return a sentence that lists `options`, with the ones nearest to `name` first in line.
 

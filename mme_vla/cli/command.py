@@ -116,8 +116,7 @@ def _check_command_line(config_name: str, tree: Path) -> None:
 def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
     """The text of `--help` beside these words (`mme_vla.cli.help`).
 
-    Args:
-        trees: folders of YAML files, the library's first.
+    trees: folders of YAML files, the library's first.
     """
 
     def selected_groups(overrides: Sequence[str]) -> dict[str, str]:

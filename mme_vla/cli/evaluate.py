@@ -110,9 +110,8 @@ def choose_subgoals(
 ) -> "SubgoalPredictor | None":
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
 
-    Args:
-        section: the section `subgoal` of the configuration. mode: `inline`, or `background`.
-        device: the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the predictor.
+    section: the section `subgoal` of the configuration. mode: `inline`, or `background`. device: the policy's; a
+    predictor with `device: auto` runs there too. None leaves the choice to the predictor.
     """
     from mme_vla.evaluation.rollout.evaluation import check_subgoals
     from mme_vla.processing.prompt import subgoal_kind

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from omegaconf import DictConfig
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 
 if TYPE_CHECKING:
     import torch
@@ -42,9 +42,8 @@ def load_policy(
 ) -> LoadedPolicy:
     """Load `checkpoint`, or build `model` with fresh weights and say so.
 
-    Args:
-        cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from.
-        verb: what the command does with it, for messages. device: instead of the configured one.
+    cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from. verb: what the command does
+    with it, for messages. device: instead of the configured one.
     """
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
@@ -63,12 +62,11 @@ def load_policy(
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)
         return LoadedPolicy(policy, name, where)
-    if not any(word.startswith("model=") for word in named):
-        raise UserError(
-            f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out."
-        )
-    if cfg.dtype not in ("auto", "float32"):
-        raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
+    require(
+        any(word.startswith("model=") for word in named),
+        f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out.",
+    )
+    require(cfg.dtype in ("auto", "float32"), f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
     robot = policy.embodiment
     policy.require_processor().stats = NormStats.unit(robot.state.width, robot.action.width)

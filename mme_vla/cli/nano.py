@@ -63,8 +63,7 @@ def command(cfg: DictConfig) -> None:
 def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     """All stages of a run; the path of its page; of a folder, where other commands are to continue there.
 
-    Args:
-        config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
+    config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
     """
     from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
@@ -152,8 +151,7 @@ def record_all(
 ) -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
 
-    Args:
-        choices: what the memories that will train on them read. robot: the one that does.
+    choices: what the memories that will train on them read. robot: the one that does.
     """
     from mme_vla.data.console import progress
     from mme_vla.nano.demonstrations import Scene

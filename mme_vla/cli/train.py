@@ -43,8 +43,7 @@ def main(cfg: DictConfig) -> None:
 def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, named: bool = True) -> Path:
     """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
 
-    Args:
-        named: whether the user chose the folder's name; another run may have begun in the same second.
+    named: whether the user chose the folder's name; another run may have begun in the same second.
 
     Returns:
         The last checkpoint.

@@ -37,7 +37,7 @@ from mme_vla.config.naming import (
     variant_name,
 )  # fmt: skip
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 VERSION_BASE = "1.3"
 
@@ -108,8 +108,7 @@ def compose(
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     for folder in trees:
-        if not folder.is_dir():
-            raise UserError(f"The config folder {str(folder)!r} does not exist.")
+        require(folder.is_dir(), f"The config folder {str(folder)!r} does not exist.")
     words = several_memories(overrides)
     with local_hydra(trees[0], trees[1:]) as engine:
         tree = ConfigTree(engine.config_loader, config_name, parse(words))
@@ -148,8 +147,7 @@ def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overr
 
     A list on the command line counts alone. The library's own files name no plugins.
 
-    Args:
-        trees: folders of YAML files, the library's first. overrides: those of the composition.
+    trees: folders of YAML files, the library's first. overrides: those of the composition.
     """
     if not trees[1:] or any(word.lstrip("+").startswith("plugins=") for word in overrides):
         return
@@ -176,8 +174,7 @@ def import_plugins(cfg: DictConfig) -> None:
 def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
     """The name of a composition, from the models of these trees.
 
-    Args:
-        config_name: the file that was composed. trees: folders of YAML files, the library's first.
+    config_name: the file that was composed. trees: folders of YAML files, the library's first.
     """
     if isinstance(cfg.get("memory"), ListConfig):
         cfg = join_memories(cfg.copy())

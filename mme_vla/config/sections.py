@@ -77,7 +77,7 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: Any) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 

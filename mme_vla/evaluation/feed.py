@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.envs.metadata import SESSIONS, read_variant
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.base import Policy
@@ -39,8 +39,7 @@ class Feed:
     def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
         """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is left out.
 
-        Args:
-            exec_start: the episode's first execution frame. before: frames of the sessions.
+        exec_start: the episode's first execution frame. before: frames of the sessions.
         """
         frames = np.asarray(frames, np.int64)
         video = exec_start if self.video else 0
@@ -157,8 +156,7 @@ class FedPolicy(Policy):
     def __init__(self, inner: Policy, feed: Feed, sessions: Sequence[Recording] = ()) -> None:
         """Wrap a policy.
 
-        Args:
-            sessions: recorded episodes; the first `feed.sessions` of them are observed before each episode.
+        sessions: recorded episodes; the first `feed.sessions` of them are observed before each episode.
         """
         super().__init__()
         self.inner, self.feed, self.sessions = inner, feed, list(sessions)[: feed.sessions]
@@ -228,8 +226,7 @@ def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -
     """
     variant = read_variant(split)
     if variant is None or variant.dial != SESSIONS:
-        if recordings:
-            raise UserError(f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
+        require(not recordings, f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
         return policy
     count = variant.sessions
     if not count:

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.utils import parse_json, to_line, verified
 
 Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
@@ -131,8 +131,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays. Different outcomes
     of one episode are refused: the same checkpoint and seed were evaluated twice.
 
-    Args:
-        records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
+    records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
     if conflicts not in ("refuse", "first", "last"):
         raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
@@ -143,18 +142,18 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
         if old is None or (old.outcome == "error" and new.outcome != "error"):
             merged[at] = new
             continue
-        if new.seed != old.seed:
-            raise UserError(
-                f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
-                "these are not the same benchmark; evaluate both from the same episode metadata."
-            )
+        require(
+            new.seed == old.seed,
+            f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
+            "these are not the same benchmark; evaluate both from the same episode metadata.",
+        )
         if new.outcome in (old.outcome, "error"):
             continue
-        if conflicts == "refuse":
-            raise UserError(
-                f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
-                f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last."
-            )
+        require(
+            conflicts != "refuse",
+            f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
+            f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last.",
+        )
         if (conflicts == "last") == (new.when > old.when):
             merged[at] = new
     return list(merged.values())

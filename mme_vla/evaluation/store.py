@@ -18,7 +18,7 @@ from urllib.parse import quote, unquote
 from mme_vla.config.naming import digest, flat
 from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compositions, finished
 from mme_vla.utils import (
     draft_of,
@@ -46,9 +46,8 @@ def fingerprint(settings: Mapping[str, Any]) -> str:
 def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Begin a run in `folder`, or continue with the one that is there.
 
-    Args:
-        settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, …
-        notes: what does not (device, workers, versions); written down when the run begins, never compared.
+    settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, … notes: what
+    does not (device, workers, versions); written down when the run begins, never compared.
 
     Returns:
         What `run.json` holds. Several shards may claim the same folder at once: the first writes it.
@@ -79,11 +78,11 @@ def read_run(folder: Path) -> dict[str, Any]:
     """Read a folder's `run.json`."""
     path = folder / RUN_FILE
     content = read_json(path, "a run's settings", finite=False)
-    if content.get("fingerprint") != fingerprint(content.get("settings", {})):
-        raise UserError(
-            f"{path} is damaged or was changed manually: its settings do not have its fingerprint. Remove it if the "
-            "records beside it are of this run."
-        )
+    require(
+        content.get("fingerprint") == fingerprint(content.get("settings", {})),
+        f"{path} is damaged or was changed manually: its settings do not have its fingerprint. Remove it if the "
+        "records beside it are of this run.",
+    )
     return verified(content, str(path))
 
 
@@ -248,8 +247,7 @@ class Claims:
     def __init__(self, folder: Path, records: str) -> None:
         """Join the run. Gives back what an earlier process with the same file of records had not finished.
 
-        Args:
-            folder: of the run. records: the name of the file that this process holds and writes its records to.
+        folder: of the run. records: the name of the file that this process holds and writes its records to.
         """
         self.folder, self.records = folder, records
         self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}

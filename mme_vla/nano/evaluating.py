@@ -87,8 +87,7 @@ def run_episodes(
 
     A policy that reads subgoals gets the simulator's.
 
-    Args:
-        split, episodes, shard: as `evaluate` has them.
+    split, episodes, shard: as `evaluate` has them.
     """
     policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
     kind = subgoal_kind(policy)
@@ -110,8 +109,7 @@ def run_episodes(
 def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord]) -> list[Path]:
     """Videos of the first success and the first failure of these records, run once more with every frame rendered.
 
-    Args:
-        folder: of the videos; what it has is not rendered again.
+    folder: of the videos; what it has is not rendered again.
     """
     for won in (True, False):
         record = next((record for record in records if record.success is won), None)

@@ -39,10 +39,9 @@ def compose_policy(
 ) -> dict[str, Any]:
     """Compose one model at nano size, as plain values, and import its plugins.
 
-    Args:
-        model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
-        words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
-        extra_dirs: further trees, as `--config-dir` adds them. plugins: modules that the model needs beside its own.
+    model: a file of configs/model. memories: settings of each memory by its name, used where the model has it. words:
+    overrides that all models share, such as `embodiment=robomme_waypoint_front`. extra_dirs: further trees, as
+    `--config-dir` adds them. plugins: modules that the model needs beside its own.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
     memory = None if base.memory is None else str(base.memory.name)
@@ -71,9 +70,8 @@ def train(
 ) -> Path:
     """Train a policy in `folder`, or continue with it; the last checkpoint.
 
-    Args:
-        config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`.
-        files: demonstrations; one in `HELD_OUT` only measures the loss.
+    config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`. files:
+    demonstrations; one in `HELD_OUT` only measures the loss.
     """
     from accelerate import Accelerator
 

@@ -31,9 +31,7 @@ _CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out wher
 def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Images of one scene, differently arranged each time.
 
-    Args:
-        count: arrangements; each gives an image of the front camera and one of the wrist's.
-        size: side of the images.
+    count: arrangements; each gives an image of the front camera and one of the wrist's. size: side of the images.
 
     Returns:
         images [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.

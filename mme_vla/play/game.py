@@ -14,7 +14,7 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
 ONGOING = "ongoing"
@@ -105,8 +105,7 @@ class ChoiceSession:
 
     def start(self) -> Reveal:
         """Reset the environment, which shows the conditioning video, if any, and then the present frame."""
-        if self.reveals:
-            raise UserError("This session has begun; make a new one for another episode.")
+        require(not self.reveals, "This session has begun; make a new one for another episode.")
         started = self._clock()
         observation, info = self.env.reset()
         self._simulated += self._clock() - started
@@ -125,9 +124,8 @@ class ChoiceSession:
     def choose(self, action: Mapping[str, Any], note: Mapping[str, Any] | None = None) -> Reveal:
         """Carry out an option.
 
-        Args:
-            action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs one.
-            note: what to keep with the decision.
+        action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs one. note: what to
+        keep with the decision.
 
         Returns:
             The frames of the motion; none where nothing moved, or the environment could not do it.
@@ -165,11 +163,7 @@ class ChoiceSession:
         return option, checked_point(action.get("point"), option) if option.needs_point else None
 
     def give_up(self, outcome: str, reason: str) -> None:
-        """End the episode without the environment.
-
-        Args:
-            outcome: what it counts as. reason: why, kept in the record.
-        """
+        """End the episode without the environment. outcome: what it counts as. reason: why, kept in the record."""
         if outcome not in OUTCOMES or self.over:
             raise ValueError(f"An episode that is {self.status} cannot end with {outcome!r}.")
         self.status, self.ended_by = outcome, reason
@@ -202,8 +196,7 @@ class ChoiceSession:
         self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
     ) -> EpisodeRecord:
         """The episode as evaluation keeps it, its decisions in `extra`."""
-        if not self.over:
-            raise UserError(f"The episode is not over ({self.status}); there is nothing to record yet.")
+        require(self.over, f"The episode is not over ({self.status}); there is nothing to record yet.")
         which = self.episode
         ended = {"ended_by": self.ended_by} if self.ended_by else {}
         return EpisodeRecord(
@@ -251,6 +244,5 @@ def checked_point(point: Any, option: Option) -> tuple[float, float]:
         problem = f"needs two numbers as its point, a pixel's row and column; got {point!r}"
     elif not ((values >= 0) & (values < SIDE)).all():
         problem = f"needs a point of the image, and {point} lies outside of the image: 0 to {SIDE - 1}"
-    if problem:
-        raise UserError(f"{what} {problem}.")
+    require(not problem, f"{what} {problem}.")
     return float(values[0]), float(values[1])

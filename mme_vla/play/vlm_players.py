@@ -50,10 +50,8 @@ def choice_text(decision: Decision) -> str:
 def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = "") -> str:
     """One question that tells the whole episode, `<video>` and `<image>` where images go.
 
-    Args:
-        goal: the task in words.
-        clips: what each clip that was shown is, in order, and whether it has frames.
-        complaint: why the last reply to the same question could not be used; empty the first time.
+    goal: the task in words. clips: what each clip that was shown is, in order, and whether it has frames. complaint:
+    why the last reply to the same question could not be used; empty the first time.
     """
     lines = [f"The task: {goal}"]
     lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
@@ -135,9 +133,7 @@ def _parsed(text: str) -> dict[str, Any]:
 class ModelPlayer(Player):
     """A model that makes each choice, with retries where its reply cannot be used.
 
-    Args:
-        model: its name.
-        tries: replies that may be unusable in a row; then the episode counts as failed.
+    model: its name. tries: replies that may be unusable in a row; then the episode counts as failed.
     """
 
     def __init__(self, model: str, tries: int = 3) -> None:
@@ -170,8 +166,7 @@ class ModelPlayer(Player):
     def ask(self, session: ChoiceSession, complaint: str) -> str:
         """The model's reply to the present question, verbatim.
 
-        Args:
-            complaint: why its last reply to the same question could not be used; empty the first time.
+        complaint: why its last reply to the same question could not be used; empty the first time.
 
         Raises:
             NoChoiceError: the model sent no reply.
@@ -249,10 +244,8 @@ class QwenPlayer(ModelPlayer):
 class GeminiPlayer(ModelPlayer):
     """One conversation an episode: each turn brings the frames since the last decision.
 
-    Args:
-        tries: replies that may be unusable in a row.
-        client: an object with google-genai's `client.models.generate_content`; None makes one.
-        settings: keys of `mme_vla.subgoal.models.connection.Settings`.
+    tries: replies that may be unusable in a row. client: an object with google-genai's
+    `client.models.generate_content`; None makes one. settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
 
     provider = "gemini"

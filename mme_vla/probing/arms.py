@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.feed import Feed
 from mme_vla.policy.base import Policy
-from mme_vla.probing.channels import Channel, NoChannel, Remembered
+from mme_vla.probing.channels import Channel, Remembered
 from mme_vla.probing.interventions import NEEDS, Intervention, Moment
 from mme_vla.registry import INTERVENTIONS
 
@@ -49,8 +49,7 @@ class Arm:
         if not allowed:
             return None
         both: np.ndarray = reduce(np.intersect1d, allowed)
-        if not len(both):
-            raise UserError(f"{self.name} leaves no frame to remember: its parts allow different ones.")
+        require(len(both), f"{self.name} leaves no frame to remember: its parts allow different ones.")
         return both
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
@@ -113,12 +112,11 @@ def read_arms(specs: Any) -> list[Arm]:
 def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool) -> str | None:
     """What an arm needs and lacks, for a message; None where it can be probed.
 
-    Args:
-        recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
+    recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
     """
     robot = policy.embodiment
     there = {
-        "entries": not isinstance(channel, NoChannel),
+        "entries": type(channel) is not Channel,
         "choice": channel.chooses,
         "clock": channel.clock is not None,
         "pauses": channel.sees_pauses,

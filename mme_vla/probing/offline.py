@@ -86,9 +86,8 @@ def probe_offline(
 ) -> list[Line]:
     """Probe every recorded episode that the file holds no lines of yet; all its lines, old and new.
 
-    Args:
-        recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines.
-        after: called after each episode with 1.
+    recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines. after: called
+    after each episode with 1.
     """
     _, done = lines.read(path)
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None

@@ -233,8 +233,7 @@ UNITS = (
 def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
     """The frames remembered at a step, each with its age and how the chunk changes without it; the current one last.
 
-    Args:
-        lines: of one step. recording: theirs.
+    lines: of one step. recording: theirs.
     """
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):

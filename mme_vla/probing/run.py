@@ -200,8 +200,7 @@ def named(model: str, arm: Arm) -> str:
 def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
     """Each arm against the unprobed run, over the episodes that both have, corrected for their number.
 
-    Args:
-        model: the unprobed one's name.
+    model: the unprobed one's name.
     """
     tasks = tuple(dict.fromkeys(record.task for record in records))
     if not tasks:

@@ -163,6 +163,16 @@ def test_composing_leaves_a_running_hydra_as_it_was(tree: Path) -> None:
         assert GlobalHydra.instance().hydra is outer
 
 
+def test_plugins_of_several_files_add_up(tmp_path: Path) -> None:
+    own = {
+        "model/own.yaml": "# @package _global_\ndefaults: [{/memory: mine}]\nname: own\nplugins: [one]\n",
+        "memory/mine.yaml": "# @package _global_\nmemory: {name: framesamp}\nplugins: [two, one]\n",
+    }
+    mine = write_tree(tmp_path / "mine", own)
+    assert compose("train", ["model=own"], extra_dirs=[mine]).plugins == ["two", "one"]
+    assert compose("train", ["model=own", "plugins=[three]"], extra_dirs=[mine]).plugins == ["three"]
+
+
 def test_plugins_are_imported_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_plugin_module.py").write_text("import sys\nloaded = True\n")
     (tmp_path / "my_broken_plugin.py").write_text("import no_such_module_here\n")
@@ -243,6 +253,8 @@ def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     ], swept.stderr
     output = run(app, "--cfg", "job", "seed=5")
     assert "seed: 5" in output.stdout
+    both = run(app, "--cfg", "job", "--multirun")
+    assert both.returncode == 2 and "Use one of --multirun and --cfg" in both.stderr
     assert run(app, "--help").returncode == 0
     wrong = run(app, "--config-dir", "nowhere")
     assert wrong.returncode == 2

@@ -198,7 +198,7 @@ def test_laps_of_a_watch_add_up_to_the_total() -> None:
             noise = torch.randn(2, 20, 32, generator=torch.Generator().manual_seed(seed))
             policy.sample_actions(batch, noise, steps=1)
             laps.append((attention.lap().layers, modulation.lap().overall["scale"][0]))
-        with pytest.raises(UserError, match="No action token"):
+        with pytest.raises(UserError, match="has seen nothing"):
             attention.lap()
     assert not torch.equal(laps[0][0], laps[1][0])
     assert torch.stack([mass for mass, _ in laps]).mean(0) == pytest.approx(attention.result().layers)

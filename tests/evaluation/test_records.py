@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,15 @@ def test_a_record_survives_its_line() -> None:
 
 
 def test_wrong_values_are_named() -> None:
-    with pytest.raises(UserError, match=r"outcome 'sucess'.*'success'"):
-        record(outcome="sucess")
-    with pytest.raises(UserError, match=r"episode='3'.*int, not str"):
-        record(episode="3")
-    with pytest.raises(UserError, match="unknown field 'sucess'"):
-        EpisodeRecord.from_json('{"sucess": true}')
-    with pytest.raises(UserError, match="missing"):
-        EpisodeRecord.from_json('{"model": "pi05"}')
+    good = asdict(record())
+    for values, message in (
+        ({**good, "outcome": "sucess"}, r"outcome='sucess'.*'success'"),
+        ({**good, "episode": "3"}, r"record\.episode='3' must be a whole number"),
+        ({**good, "sucess": True}, r"Unknown key record\.sucess"),
+        ({"model": "pi05"}, "lacks the key 'checkpoint'"),
+    ):
+        with pytest.raises(UserError, match=message):
+            EpisodeRecord.from_dict(values)
 
 
 def test_a_half_saved_last_line_is_ignored_and_then_repaired(tmp_path: Path) -> None:

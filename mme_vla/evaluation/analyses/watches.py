@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.attention import layout_mask
 from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, StaticKV
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.integration.modulator import Modulator
 from mme_vla.policy.mme import MMEPolicy
 
@@ -69,8 +69,7 @@ class Watch[T]:
         return self._checked(since)
 
     def _checked(self, sums: Tensor) -> T:
-        if not sums.any():
-            raise UserError(f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.")
+        require(sums.any(), f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.")
         return self._read(sums)
 
     def _hooks(self) -> list[Any]:
@@ -172,8 +171,7 @@ class ModulationWatch(Watch[ModulationStats]):
         integration = self.policy.integration
         if not isinstance(integration, Modulator):
             raise UserError(
-                "This policy has no modulator, so no scale and bias to observe: choose one with integration=modulator, "
-                "such as framesamp_modul."
+                "This policy has no modulator to observe: choose integration=modulator, or framesamp_modul."
             )
         if not self._sums.ndim:
             self._sums = torch.zeros(len(integration.layers), 2, 3, dtype=torch.float64)

@@ -154,8 +154,7 @@ def demo_records(
 
     An episode is as hard for every method, so that runs agree as real ones do.
 
-    Args:
-        methods: (model, subgoal predictor) pairs that the paper reports.
+    methods: (model, subgoal predictor) pairs that the paper reports.
     """
     records = []
     for model, subgoal in methods:

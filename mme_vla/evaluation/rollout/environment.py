@@ -100,8 +100,7 @@ class ChunkEnv:
     def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, dict[str, Any]]:
         """All frames of the conditioning video, the current one last, and the report.
 
-        Args:
-            draw: the requested images; by default all.
+        draw: the requested images; by default all.
         """
         self._ask(draw)
         with self._simulation():
@@ -116,9 +115,8 @@ class ChunkEnv:
     def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute actions one after the other until they, or the episode, are over.
 
-        Args:
-            command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that
-                are requested, where it is not all: frames are counted from the reset on, and the newest is the last.
+        command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that are
+        requested, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
             The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
@@ -280,10 +278,8 @@ def make_rollout_env(
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
-    Args:
-        base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
-        videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
-        robot, most_actions: the policy's.
+    base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`. videos: folder, and
+    which outcomes are kept: `all`, `success` or `failure`. robot, most_actions: the policy's.
     """
     video = None
     if videos is not None:

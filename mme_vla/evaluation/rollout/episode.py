@@ -30,8 +30,7 @@ class RunningEpisode:
     Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of a conditioning
     video do not keep other episodes waiting.
 
-    Args:
-        subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
+    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
     """
 
     def __init__(

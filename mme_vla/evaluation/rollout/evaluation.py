@@ -11,7 +11,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
@@ -49,8 +49,7 @@ def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, sp
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
     """Read `0/4` (the first of four), or the rank of this process under torchrun.
 
-    Args:
-        text: wins over the environment. environment: by default the process's own.
+    text: wins over the environment. environment: by default the process's own.
     """
     environment = os.environ if environment is None else environment
     if text is None:
@@ -59,8 +58,7 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
         text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
-    if shard.index >= shard.count:
-        raise UserError(f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
+    require(shard.index < shard.count, f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
     return shard
 
 
@@ -229,8 +227,7 @@ def facts_of(
 ) -> RunFacts:
     """What the records of a run have in common.
 
-    Args:
-        name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the predictor.
+    name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the predictor.
     """
     return RunFacts(
         name or str(policy.config.get("name", "policy")), checkpoint_label(source), settings.seed, settings.split,

@@ -25,8 +25,7 @@ LONGEST_VIDEO = 10_000  # frames
 class RenderPlan:
     """The images to render for each command to an environment; None requests everything.
 
-    Args:
-        policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
+    policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
     """
 
     def __init__(self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings) -> None:
