@@ -14,6 +14,13 @@ def require(holds: object, message: str) -> None:
         raise UserError(message)
 
 
+def require_choice(key: str, value: object, options: Iterable[str]) -> None:
+    """Raise a `UserError` that lists the options unless a value is one of them."""
+    known = list(options)
+    if value not in known:
+        raise UserError(f"{key}={brief(value)}. {did_you_mean(str(value), known)}")
+
+
 def did_you_mean(name: str, options: Iterable[str]) -> str:
     """Return a sentence that lists `options`, with the ones nearest to `name` first in line.
 

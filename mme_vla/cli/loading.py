@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from omegaconf import DictConfig
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.errors import UserError, require, require_choice
 
 if TYPE_CHECKING:
     import torch
@@ -82,8 +82,7 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
     """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
     from mme_vla.policy.capabilities import CompilesSampling
 
-    if sampling not in SAMPLING:
-        raise UserError(f"sampling={sampling!r}. {did_you_mean(str(sampling), SAMPLING)}")
+    require_choice("sampling", sampling, SAMPLING)
     on_gpu = policy.device.type == "cuda"
     if sampling == "graph" and not on_gpu:
         raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")

@@ -20,10 +20,13 @@ from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import read_runs, training_details
 from mme_vla.evaluation.results.scopes import TEST_EPISODES, Protocol, tasks_of
 from mme_vla.evaluation.results.tables import (
+    Table,
     comparison_table,
+    detail,
     leaderboard,
     overview,
     print_table,
+    runs_table,
     to_csv,
     to_latex,
     to_markdown,

@@ -60,7 +60,7 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
     needed = [n for n, spec in specs.items() if spec.default is MISSING and spec.default_factory is MISSING]
     if others and isinstance(values, Mapping):
         values = {key: value for key, value in values.items() if key in specs}
-    parsed, hints = section_keys(values, where, specs), _hints(kind)
+    parsed, hints = section_keys(values, where, specs), _hints(kind)  # type: ignore[arg-type]
     if lacking := [key for key in needed if key not in parsed]:
         raise _lacking(where, lacking[0], parsed)
     read: dict[str, Any] = {}

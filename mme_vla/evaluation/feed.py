@@ -231,10 +231,11 @@ def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -
     count = variant.sessions
     if not count:
         return policy
-    if policy.embodiment.readings or not recordings:
-        raise UserError(f"split={split} needs recorded episodes to take from: name them with recordings=….")
-    if count > len(recordings):
-        raise UserError(f"split={split} needs {count} recorded episodes to take from, and there are {len(recordings)}.")
+    if policy.embodiment.readings or count > len(recordings):
+        raise UserError(
+            f"split={split} needs {count} recorded episodes to take from, and there are {len(recordings)}: name them "
+            "with recordings=…."
+        )
     fed = FedPolicy(policy, Feed(sessions=count), recordings).eval()
     fed.n_distractor_episodes = count
     # The names are those of the probe's arm, so that runs of earlier versions continue.

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
-from mme_vla.errors import UserError, brief, did_you_mean, require
+from mme_vla.errors import UserError, require, require_choice
 from mme_vla.utils import parse_json, to_line, verified
 
 Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
@@ -120,8 +120,7 @@ class EpisodeRecord:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Read the object of a line, without its checksum."""
         record = read_section(cls, {**values, "seconds": values.get("seconds") or {}}, "record")
-        if record.outcome not in OUTCOMES:
-            raise UserError(f"record.outcome={brief(record.outcome)}. {did_you_mean(record.outcome[:80], OUTCOMES)}")
+        require_choice("record.outcome", record.outcome, OUTCOMES)
         return record
 
 
@@ -133,8 +132,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
 
     records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
-    if conflicts not in ("refuse", "first", "last"):
-        raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
+    require_choice("conflicts", conflicts, ("refuse", "first", "last"))
     merged: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
     for new in records:
         at = (new.run, new.key)

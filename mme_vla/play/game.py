@@ -150,15 +150,19 @@ class ChoiceSession:
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
         """The option and point that an action means."""
-        if self.status != ONGOING:
-            raise UserError(f"No choice can be made: the episode is over ({self.status})." if self.reveals
-                            else "No choice can be made before start().")  # fmt: skip
-        if not isinstance(action, Mapping) or not isinstance(action.get("choice"), str):
-            raise UserError(f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.')
-        label = action["choice"].strip().lower()
         options = {option.label: option for option in self.options}
-        if label not in options:
-            raise UserError(f"There is no option {action['choice']!r}. {did_you_mean(label, options)}")
+        choice = action.get("choice") if isinstance(action, Mapping) else None
+        label = choice.strip().lower() if isinstance(choice, str) else None
+        problem = ""
+        if self.status != ONGOING:
+            when = f": the episode is over ({self.status})" if self.reveals else " before start()"
+            problem = f"No choice can be made{when}."
+        elif label is None:
+            problem = f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.'
+        elif label not in options:
+            problem = f"There is no option {choice!r}. {did_you_mean(label, options)}"
+        if problem or label is None:
+            raise UserError(problem)
         option = options[label]
         return option, checked_point(action.get("point"), option) if option.needs_point else None
 

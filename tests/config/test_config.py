@@ -115,11 +115,6 @@ def test_options_may_stand_anywhere(words: list[str]) -> None:
     assert (args.config_dir, args.multirun, args.overrides) == ("b", True, ["a=1", "c=2", "d=3"])
 
 
-def test_an_options_value_may_equal_a_word() -> None:
-    words = ["--config-dir", "memory", "--help", "memory"]
-    assert options_first(words) == words
-
-
 def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
     check_overrides(
         "demo",
@@ -138,13 +133,6 @@ def test_the_same_words_give_equal_but_separate_configurations() -> None:
     one.memory.budget = 64
     again = compose("train", words)
     assert again == other and again.train.steps == 3
-
-
-def test_files_of_the_user_are_read_again_each_time(tree: Path) -> None:
-    before = compose("demo", directory=tree).seed
-    file = tree / "demo.yaml"
-    file.write_text(file.read_text().replace(f"seed: {before}", f"seed: {before + 1}"))
-    assert compose("demo", directory=tree).seed == before + 1
 
 
 def test_further_folders_add_choices(tree: Path, tmp_path: Path) -> None:

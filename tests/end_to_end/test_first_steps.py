@@ -18,7 +18,6 @@ from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import Table, print_table
 from mme_vla.policy.run_folders import find_run, resolve_checkpoint
-from mme_vla.training.loop import worse_than_still
 from mme_vla.training.runs import weights_to_start_from
 
 
@@ -42,15 +41,6 @@ def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
     assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=none"]).init_from) is None
     assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=x/y"]).init_from) == "x/y"
     assert weights_to_start_from(compose("train", []).init_from) is None
-
-
-def test_a_run_that_is_worse_than_holding_still_says_why() -> None:
-    summary = {"names": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
-    assert worse_than_still(summary, 350).startswith(
-        "1 of 2 numbers of the action are predicted worse than by holding still"
-    )
-    assert "350 updates" in worse_than_still(summary, 350)
-    assert worse_than_still({**summary, "mean_abs_error": [0.05, 0.1]}, 350) == ""
 
 
 @pytest.mark.parametrize("won", [False, True])

@@ -185,23 +185,3 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
     policy.reset()
     exact = policy.predict_action_chunk(batch, inference_delay=4, prev_chunk_left_over=left)
     assert torch.equal(bound, exact)
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"observation.state": None}, "needs the feature 'observation.state' of 8 numbers; there is none"),
-        ({"observation.images.image": None}, "No images of the camera 'front'"),
-    ],
-)
-def test_what_a_dataset_lacks_is_named(
-    package: ModuleType, our_folder: Path, changed: dict[str, None], message: str
-) -> None:
-    from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
-
-    policy = Policy.from_pretrained(our_folder)
-    images, numbers = package.convert.features_of(policy.embodiment)
-    features = {name: feature for name, feature in images.items() if name not in changed}
-    config = package.MMEVLAConfig(device="cpu", input_features=features, output_features=numbers)
-    with pytest.raises(UserError, match=message):
-        MMEVLAPolicy(config, model=policy)

@@ -14,7 +14,7 @@ from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.progress import Durations, earlier_records
+from mme_vla.evaluation.rollout.progress import Durations
 from mme_vla.evaluation.rollout.runner import Waiting
 from mme_vla.evaluation.store import Claims, RecordLog
 from mme_vla.utils import write_json
@@ -152,17 +152,6 @@ def test_the_forecast_follows_whoever_is_slower() -> None:
         "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1 before them did"
     )
     assert Durations([]).forecast(JOBS, workers=1) is None
-
-
-def test_earlier_records_are_those_beside_the_run_or_those_named(tmp_path: Path) -> None:
-    with RecordLog(tmp_path / "runs" / "seed7" / "episodes.jsonl") as log:
-        log.append(record(0))
-        log.append(record(1, outcome="error"))
-    assert len(earlier_records(tmp_path / "runs" / "seed42", None)) == 1
-    assert earlier_records(tmp_path / "seed42", None) == []
-    assert len(earlier_records(tmp_path, tmp_path / "runs")) == 1
-    with pytest.raises(UserError):
-        earlier_records(tmp_path, tmp_path / "nothing")
 
 
 def test_an_episode_that_is_tried_again_comes_last() -> None:

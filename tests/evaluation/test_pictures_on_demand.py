@@ -13,7 +13,6 @@ from mme_vla import UserError
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
-from mme_vla.subgoal.oracle import Oracle
 
 FRAMES = [VIDEO[JOBS[0].task] + 1 + STEPS, 1 + STEPS]
 MEMORIES: dict[str, dict[str, Any]] = {
@@ -39,14 +38,6 @@ def test_rendering_what_is_needed_changes_no_action(name: str) -> None:
         assert video["front"] == full["front"] == full["wrist"]
     else:
         assert full["front"] < FRAMES[1] and video["front"] < FRAMES[0]
-
-
-@pytest.mark.parametrize("name", ["simplesg", "groundsg"])
-def test_the_environments_subgoals_need_no_images(name: str) -> None:
-    policy = quick_policy(name)
-    kind = "simple" if name == "simplesg" else "grounded"
-    *_, video, full = both_ways(policy, Oracle(kind))
-    assert video == full == {"front": 5, "wrist": 5}
 
 
 class Watcher(SubgoalPredictor):
@@ -107,14 +98,6 @@ def test_a_video_shows_everything_and_changes_nothing(name: str, tmp_path: Path)
         job: {"front": n, "wrist": n} for job, n in zip(JOBS, FRAMES, strict=True)
     }
     assert all((tmp_path / record.extra["video"]).stat().st_size for record in recorded)
-
-
-def test_a_policy_that_does_not_say_what_it_reads_gets_all_frames() -> None:
-    policy = quick_policy("pi05")
-    policy.frames_read = lambda steps, exec_start: None
-    envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1)
-    roll(policy, JOBS, envs, max_steps=STEPS - 1)
-    assert [env.drawn["wrist"] for env in envs.made.values()] == FRAMES
 
 
 def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:

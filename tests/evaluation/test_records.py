@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from mme_vla import UserError
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, Seconds, by_run, finished, merge
+from mme_vla.evaluation.records import EpisodeRecord, Seconds, by_run, merge
 from mme_vla.evaluation.store import RecordLog, claim_run, find_records, read_records, read_run
 
 
@@ -106,13 +106,6 @@ def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
         merge([early], "lst")
 
 
-def test_other_runs_and_subgoals_and_budgets_do_not_conflict() -> None:
-    changes = {"model_seed": 0, "checkpoint": 1, "subgoal": "oracle", "memory_budget": 64, "split": "val"}
-    different = [record(), *(record(outcome="fail", **{name: value}) for name, value in changes.items())]
-    assert merge(different) == different
-    assert len(by_run(different)) == len(different)
-
-
 def test_one_episode_in_two_environments_is_refused() -> None:
     with pytest.raises(UserError, match="seeds 540000 and 1"):
         merge([record(), record(seed=1)])
@@ -121,12 +114,6 @@ def test_one_episode_in_two_environments_is_refused() -> None:
 def test_a_run_of_two_step_limits_is_refused() -> None:
     with pytest.raises(UserError, match="mixes max_steps 300 and 1300"):
         by_run([record(), record(episode=1, max_steps=300)])
-
-
-def test_errors_are_retried_by_default() -> None:
-    records = [record(), record(episode=1, outcome="error"), record(episode=2, outcome="timeout")]
-    assert finished(records) == {EpisodeKey("BinFill", 0), EpisodeKey("BinFill", 2)}
-    assert finished(records, retry_errors=False) == {EpisodeKey("BinFill", e) for e in range(3)}
 
 
 def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:

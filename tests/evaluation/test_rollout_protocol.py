@@ -7,7 +7,7 @@ import torch
 from helpers.rollout_fakes import JOBS, InlineEnvs, quick_policy, roll
 from helpers.scripted_env import VIDEO, make_moving_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.episode import RunningEpisode, episode_seed
+from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal import build_predictor
 from mme_vla.testing.small import cached_history
@@ -56,12 +56,6 @@ def test_an_episode_that_ends_inside_a_chunk_ends_there(memoryless):
     assert len(envs.made[UNMASK].actions) == record.steps
 
 
-def test_the_stick_gets_seven_numbers(memoryless):
-    job, envs = Job("PatternLock", "test", 2), InlineEnvs()
-    roll(memoryless, [job], envs)
-    assert {action.shape for action in envs.made[job].actions} == {(7,)}
-
-
 @pytest.mark.parametrize("job", [UNMASK, Job("PickXtimes", "test", 1)])
 def test_the_current_view_and_state_are_those_after_the_last_action(memoryless, monkeypatch, job):
     watched = Watched(memoryless, monkeypatch, lambda e: (e.n_observed_frames, e.images.clone(), e.state.clone()))
@@ -92,22 +86,6 @@ def test_memory_holds_at_every_inference_what_training_would_select(name, encode
         assert torch.equal(recalled.mask, offline.mask)
         assert torch.equal(recalled.positions, offline.positions)
         assert torch.allclose(recalled.features, offline.features, atol=1e-5)
-
-
-def test_conditioning_frames_are_highlighted_and_the_current_one_is_not(monkeypatch):
-    policy, calls = quick_policy("framesamp_context"), []
-    monkeypatch.setattr(
-        "mme_vla.policy.episode.Episode._take",
-        lambda self, front, demo, executed, states: calls.append((front.length, int(demo.sum()))),
-    )
-    running = RunningEpisode(policy, UNMASK, 0, piece=8)
-    image = np.zeros((64, 64, 3), np.uint8)
-    frames = {"front": [image] * 22, "wrist": [image] * 22, "state": np.zeros((22, 8), np.float32)}
-    running.begin(frames, {"task_goal": ["goal"]})
-    assert running.pieces == 3
-    while running.pieces:
-        running.read()
-    assert calls == [(8, 8), (8, 8), (6, 5)]
 
 
 def test_past_actions_in_the_prompt_are_those_executed(monkeypatch):

@@ -11,15 +11,11 @@ from helpers import commands
 from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
-from mme_vla.cli.evaluate import choose_device
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
     Shard,
-    checkpoint_label,
     choose_shard,
-    default_output,
-    memory_budget,
 )
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -179,15 +175,6 @@ def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:
             choose_shard(wrong, {})
 
 
-def test_a_process_of_torchrun_takes_its_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
-    monkeypatch.setenv("LOCAL_RANK", "3")
-    assert choose_device("auto") == torch.device("cuda", 3)
-    assert choose_device("cuda:1") == torch.device("cuda", 1)
-    assert choose_device("cpu") == torch.device("cpu")
-
-
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job, **how):
@@ -223,14 +210,6 @@ def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp
     options["videos"] = (str(failed), "failure")
     roll(quick_policy("pi05"), [Job("VideoUnmask", "test", 0)], InlineEnvs(**options))
     assert list(failed.iterdir()) == []
-
-
-def test_runs_find_their_folder_by_what_they_are() -> None:
-    assert checkpoint_label("runs/a/checkpoints/step_000350") == 350
-    assert checkpoint_label("owner/pi05") == "pi05" and checkpoint_label(None) == "untrained"
-    assert str(default_output(FACTS)) == "outputs/evaluation/tiny/untrained/seed42"
-    assert memory_budget(quick_policy("framesamp_modul", memory={"budget": 64})) == 64
-    assert memory_budget(quick_policy("framesamp_modul")) is memory_budget(quick_policy("pi05")) is None
 
 
 def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.CaptureFixture) -> None:

@@ -12,7 +12,7 @@ from mme_vla.cli.play import _by_itself, line, print_summary
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import read_records
-from mme_vla.play import ChoiceSession, RandomPlayer, Reveal
+from mme_vla.play import ChoiceSession, RandomPlayer
 from mme_vla.play.players import play
 from mme_vla.play.run import Identity, PlayRun
 
@@ -32,26 +32,6 @@ def test_the_video_comes_first_then_the_frames_of_each_motion():
     assert session.frame is second.frames[-1]
     assert session.n_displayed_frames == VIDEO + 1 + MOTION
     assert session.steps == MOTION
-
-
-def test_the_episode_ends_with_the_environments_status():
-    for second, outcome in (("red", "success"), ("blue", "fail")):
-        session = a_session()
-        session.start()
-        session.choose(press("blue"))
-        assert not session.over
-        session.choose(press(second))
-        assert session.status == outcome
-        with pytest.raises(UserError, match=f"over \\({outcome}\\)"):
-            session.choose(press("red"))
-
-
-def test_a_choice_that_moves_nothing_reveals_nothing_and_the_present_image_stays():
-    session = a_session()
-    frame = session.start().frames[-1]
-    assert session.choose({"choice": " B "}) == Reveal("wait", [], VIDEO + 1)
-    assert session.frame is frame
-    assert session.steps == 0
 
 
 def test_a_player_that_never_gets_on_is_timed_out():

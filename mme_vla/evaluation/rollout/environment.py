@@ -19,7 +19,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.subtasks import Progress, process_score
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
@@ -166,10 +166,7 @@ class ChunkEnv:
     def _note_pose(self, observation: dict[str, list[Any]]) -> None:
         if not self._robot.action.of_pose:
             return
-        if "eef_state_list" not in observation:
-            available = ", ".join(sorted(observation))
-            raise UserError(f"The policy's actions are differences to 'eef_state', which this environment does not "
-                            f"deliver: only {available}.")  # fmt: skip
+        _require(observation, "eef_state", f"The policy's actions are differences to 'eef_state', {MISSING}")
         if poses := observation["eef_state_list"]:
             self._pose = np.asarray(poses[-1], np.float64)
 
@@ -217,6 +214,13 @@ def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
+MISSING = "which this environment does not deliver"
+
+
+def _require(observation: dict[str, list[Any]], name: str, message: str) -> None:
+    require(f"{name}_list" in observation, f"{message}; there are only {', '.join(sorted(observation))}.")
+
+
 class _Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
@@ -232,15 +236,11 @@ class _Frames:
         self._states += [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
         blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
         for name, images in self._images.items():
-            if not blind and name in self._cameras and f"{name}_rgb_list" not in observation:
-                raise UserError(f"The environment has no camera {name!r}; it shows {', '.join(sorted(observation))}.")
+            if not blind and name in self._cameras:
+                _require(observation, f"{name}_rgb", f"The environment has no camera {name!r}")
             images += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         for name, readings in self._readings.items():
-            if f"{name}_list" not in observation:
-                available = ", ".join(sorted(observation))
-                raise UserError(
-                    f"The policy reads {name!r}, which this environment does not deliver: only {available}."
-                )
+            _require(observation, name, f"The policy reads {name!r}, {MISSING}")
             readings += observation[f"{name}_list"]
         return len(joints)
 
