@@ -163,4 +163,4 @@ def cache_command() -> str:
     words = [word for word in overrides if not word.startswith(("resume=", "output="))]
     if "--config-dir" in sys.argv[:-1]:
         words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
-    return shlex.join(["python", "-m", "mme_vla.data.cache", *words])
+    return shlex.join(["mme-vla", "cache", *words])

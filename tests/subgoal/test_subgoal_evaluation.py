@@ -17,7 +17,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.report import html_report
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.subgoals import SubgoalScore, SubgoalTrace, point_distances, subgoal_table, total_score
+from mme_vla.evaluation.rollout.subgoals import SubgoalScore, SubgoalTrace, point_distances, subgoal_tables, total_score
 from mme_vla.evaluation.store import read_records
 from mme_vla.subgoal import BackgroundPredictor, Subgoal, SubgoalPredictor, build_predictor
 from mme_vla.subgoal.text import points_of
@@ -104,7 +104,7 @@ def test_results_tell_right_subgoals_and_distances_by_task() -> None:
 
     protocol = Protocol(("PickXtimes", "VideoUnmask"), 1)
     results = aggregate([record("PickXtimes", 4), record("VideoUnmask", 1, {"empty": 2})], protocol)
-    table = subgoal_table(results.methods[0], results)
+    (table,) = subgoal_tables(results)
     assert table is not None and [row[:5] for row in table.rows] == [
         ["PickXtimes", "1", "4", "100.0", "3.0"],
         ["VideoUnmask", "1", "4", "25.0", "3.0"],
