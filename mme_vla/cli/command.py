@@ -50,7 +50,8 @@ def cli[T](
             with print_user_errors():  # here too: Hydra would print a traceback before it gets further
                 _require_values(cfg)
                 join_memories(cfg)
-                join_plugins(cfg, config_name, command_trees(), HydraConfig.get().overrides.task)
+                hydra_cfg = HydraConfig.get()
+                join_plugins(cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task)
                 if {"name", "memory"} <= set(cfg):
                     cfg.name = name_under_hydra(_root_=cfg)
                 import_plugins(cfg)

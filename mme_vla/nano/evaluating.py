@@ -95,7 +95,8 @@ def run_episodes(
     jobs = choose_episodes(task, episodes, split)
     records: list[EpisodeRecord] = []
     for seed in seeds:
-        settings = RolloutSettings(seed=seed, split=split, max_steps=max_steps, workers=workers, video=video)
+        options = {"seed": seed, "split": split, "max_steps": max_steps, "workers": workers, "video": video}
+        settings = RolloutSettings.from_config(options)
         facts = facts_of(policy, None, str(checkpoint), settings, None if subgoals is None else ORACLE)
         facts = replace(facts, checkpoint=checkpoint.name)
         done = evaluate(

@@ -101,8 +101,6 @@ def test_an_environment_of_another_kind_is_refused():
         ChoiceSession(Blind(), an_episode()).start()
     with pytest.raises(UserError, match="multi_choice"):
         ChoiceSession(Other(), an_episode()).start()
-    with pytest.raises(UserError, match="max_choices is 0"):
-        a_session(max_choices=0)
     blind = ChoiceSession(Blind(), an_episode(), images=False)
     assert len(blind.start().frames) == VIDEO + 1
     assert not blind.frame.any()
