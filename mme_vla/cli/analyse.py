@@ -120,8 +120,9 @@ def recurrence(args: argparse.Namespace) -> None:
     numbers = range(len(source)) if args.episodes is None else args.episodes
     with _rerun(args) as log:  # before the replays: a file that cannot be written is an error at once
         episode_curves = [recurrence_curves(policy, source, episode, args.stride) for episode in numbers]
-        for curves in episode_curves if log is not None else ():
-            for i, frame in enumerate(curves.frames.tolist()):
+        for curves in episode_curves:
+            for i, frame in enumerate(curves.frames.tolist() if log is not None else ()):
+                assert log is not None
                 log.views(source, curves.episode, frame)
                 for key, values in curves.curves.items():
                     log.number(f"recurrence/{key}", values[i])

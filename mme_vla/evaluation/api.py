@@ -70,7 +70,7 @@ def evaluate(
     folder = default_output(facts) if output is None else Path(output).expanduser()
     donor_episodes = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
-    options = {"subgoals": predictor, "source": source, "base": base, "show_progress": show_progress}
+    options: dict[str, Any] = {"subgoals": predictor, "source": source, "base": base, "show_progress": show_progress}
     return evaluate_run(wrapped, jobs, folder, facts, run_settings, **options)
 
 

@@ -93,11 +93,9 @@ def _read_part(word: str) -> Intervention:
 
 
 def _build(section: Mapping[str, Any]) -> Intervention:
-    entry = INTERVENTIONS[section.get("name")]  # type: ignore[index]
+    entry: Any = INTERVENTIONS[section.get("name")]  # type: ignore[index]
     options = {key: value for key, value in section.items() if key != "name"}
-    built: Intervention = (
-        read_section(entry, options, section["name"]) if is_dataclass(entry) else INTERVENTIONS.build(section)
-    )
+    built: Any = read_section(entry, options, section["name"]) if is_dataclass(entry) else INTERVENTIONS.build(section)
     return built
 
 
