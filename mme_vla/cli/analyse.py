@@ -120,12 +120,12 @@ def recurrence(args: argparse.Namespace) -> None:
     numbers = range(len(source)) if args.episodes is None else args.episodes
     with _rerun(args) as log:  # before the replays: a file that cannot be written is an error at once
         episode_curves = [recurrence_curves(policy, source, episode, args.stride) for episode in numbers]
-        for curves in episode_curves:
-            for i, frame in enumerate(curves.frames.tolist() if log is not None else ()):
-                assert log is not None
-                log.views(source, curves.episode, frame)
-                for key, values in curves.curves.items():
-                    log.number(f"recurrence/{key}", values[i])
+        if log is not None:
+            for curves in episode_curves:
+                for i, frame in enumerate(curves.frames.tolist()):
+                    log.views(source, curves.episode, frame)
+                    for key, values in curves.curves.items():
+                        log.number(f"recurrence/{key}", values[i])
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(recurrence_plot(episode_curves, f"{name} on {source.name}"), encoding="utf-8")
