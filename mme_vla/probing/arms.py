@@ -95,8 +95,9 @@ def _read_part(word: str) -> Intervention:
 def _build(section: Mapping[str, Any]) -> Intervention:
     entry: Any = INTERVENTIONS[section.get("name")]  # type: ignore[index]
     options = {key: value for key, value in section.items() if key != "name"}
-    built: Any = read_section(entry, options, section["name"]) if is_dataclass(entry) else INTERVENTIONS.build(section)
-    return built
+    if not is_dataclass(entry):
+        return INTERVENTIONS.build(section)
+    return read_section(entry, options, section["name"])  # type: ignore[arg-type, return-value]
 
 
 def read_arms(specs: Any) -> list[Arm]:
