@@ -17,15 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.data.hdf5 import (
-    POSE_STATE,
-    SUBGOALS,
-    EpisodeRef,
-    RawEpisode,
-    RawFrame,
-    open_episode,
-    recorded_options,
-)
+from mme_vla.data.hdf5 import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame, open_episode, recorded_options
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS

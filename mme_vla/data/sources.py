@@ -22,9 +22,7 @@ class Split:
 
 
 def split_episodes(
-    sources: Sequence[EpisodeSource],
-    val_fraction: float = 0.0,
-    val_episodes: Sequence[int | str] | None = None,
+    sources: Sequence[EpisodeSource], val_fraction: float = 0.0, val_episodes: Sequence[int | str] | None = None
 ) -> Split:
     """Split every source by episode.
 

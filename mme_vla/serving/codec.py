@@ -36,12 +36,7 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
     """Decode a message. Arrays are read-only views on `data`: copy what is written to."""
     check_size(data)
     try:
-        return msgpack.unpackb(
-            data,
-            object_hook=_decode,
-            max_str_len=MOST_TEXT,
-            max_ext_len=0,
-        )
+        return msgpack.unpackb(data, object_hook=_decode, max_str_len=MOST_TEXT, max_ext_len=0)
     except UserError:
         raise
     except Exception as error:  # msgpack raises many kinds of exception
@@ -103,12 +98,7 @@ def _encode(value: Any) -> dict[bytes, Any]:
     if value.dtype.kind in REFUSED_KINDS:
         raise ValueError(f"arrays of dtype {value.dtype} are not sent")
     if isinstance(value, np.ndarray):
-        return {
-            b"__ndarray__": True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": list(value.shape),
-        }
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": list(value.shape)}
     scalar = value.item()
     if not isinstance(scalar, bool | int | float | str | bytes):
         raise ValueError(f"a scalar of dtype {value.dtype} is not sent; make it a plain number")

@@ -139,7 +139,7 @@ def what_there_is(task: str, kind: str) -> list[str]:
     templates = _subgoals(task, kind)
     parts = [
         "Subgoals of this task, to be used word for word ([ordinal] is first, second, third, …; [colour] is red, blue "
-        "or green):\n" + "\n".join(f"- {text}" for text in templates),
+        "or green):\n" + "\n".join(f"- {text}" for text in templates)
     ]
     if kind == "grounded" and any(AT in text for text in templates):
         parts.append(

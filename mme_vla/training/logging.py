@@ -15,13 +15,7 @@ from typing import IO, Any, Literal, Self
 
 import numpy as np
 import torch
-from accelerate.tracking import (
-    GeneralTracker,
-    MLflowTracker,
-    TensorBoardTracker,
-    TrackioTracker,
-    WandBTracker,
-)
+from accelerate.tracking import GeneralTracker, MLflowTracker, TensorBoardTracker, TrackioTracker, WandBTracker
 from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -209,11 +203,7 @@ def trackio_tracker(
 
 @LOGGERS.register("mlflow")
 def mlflow_tracker(
-    folder: Path,
-    config: Mapping[str, Any],
-    first_step: int,
-    project: str = "mme_vla",
-    tracking_uri: str | None = None,
+    folder: Path, config: Mapping[str, Any], first_step: int, project: str = "mme_vla", tracking_uri: str | None = None
 ) -> GeneralTracker:
     """An MLflow run, in a file of the run folder or on a server; a resumed run continues the same one."""
     import mlflow

@@ -1,13 +1,6 @@
 """Files of the system: reading, writing, locks, checksums. Nothing here depends on what a file means."""
 
-from mme_vla.utils.checksums import (
-    SUMS,
-    Sums,
-    check_sums,
-    file_sum,
-    sum_line,
-    write_sums,
-)
+from mme_vla.utils.checksums import SUMS, Sums, check_sums, file_sum, sum_line, write_sums
 from mme_vla.utils.io import (
     append_lines,
     decoding,

@@ -85,11 +85,7 @@ def _openvla() -> Any:
     return importlib.import_module(METHOD_FORMATS["openvla"].module)
 
 
-VARIANTS = {
-    "pi05_baseline": "pi05",
-    "symbolic-simple-subgoal": "simplesg",
-    "symbolic-grounded-subgoal": "groundsg",
-} | {
+VARIANTS = {"pi05_baseline": "pi05", "symbolic-simple-subgoal": "simplesg", "symbolic-grounded-subgoal": "groundsg"} | {
     f"{kind}-{memory}-{integration}": f"{memory}_{integration}"
     for kind, memories in (("perceptual", ("framesamp", "tokendrop")), ("recurrent", ("rmt", "ttt")))
     for memory in memories

@@ -50,11 +50,7 @@ def heard(policy: MMEPolicy, name: str, *words: str) -> tuple[list[str | None], 
 
 @pytest.mark.parametrize("name", ["openai", "notebook"])
 def test_an_endpoint_is_tried_again_its_cost_is_reported_and_its_replies_are_replayed(
-    name: str,
-    policy: MMEPolicy,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    name: str, policy: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", SECRET)
     cache, failures = f"subgoal.cache={tmp_path}", [failure(503, f"busy, key={SECRET}"), failure(429, "slowly")]
