@@ -35,6 +35,7 @@ from mme_vla.integration.base import MEMORY_VISIBILITY
 
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0
 NOT_MEASURED = "not measured"
+Projections = tuple[Tensor, Tensor, Tensor]  # queries, keys, values
 
 
 def chunks(model: str, setup: Setup) -> dict[str, Any]:

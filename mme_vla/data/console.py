@@ -66,7 +66,6 @@ class _Lines:
         self._begun = self._reported = time.monotonic()
 
     def advance(self, steps: int) -> None:
-        """Count; say so if it is time."""
         self._done += steps
         now = time.monotonic()
         if self._done < self._total and now - self._reported < LINE_SECONDS:

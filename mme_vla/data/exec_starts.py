@@ -14,7 +14,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, listed, raise_if
 
 NEAR = 0.05  # radians on average: a demonstration that was made anew differs a little, another episode by far more
 _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
@@ -72,6 +72,5 @@ def _start_of(source: EpisodeSource, episode: int, annotated: Sequence[Annotated
             f"{source.root}, episode {episode} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} "
             f"episodes given: {near}. Give the recordings that the dataset was made from, all of them."
         )
-    if len(starts) > 1:
-        raise UserError(f"{source.root}, episode {episode}: recordings that fit alike begin at {listed(starts)}.")
+    raise_if(len(starts) > 1, f"{source.root}, episode {episode}: recordings that fit alike begin at {listed(starts)}.")
     return starts[0]

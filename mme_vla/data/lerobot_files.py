@@ -17,7 +17,7 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Camera, Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, raise_if
 from mme_vla.utils import decoding, inside, read_json, require_file
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
@@ -65,21 +65,21 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
         matches["action"] = _first(("action", "actions"), features)
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
     missing = [keys.get(name, name) for name, column in matches.items() if column is None]
-    if missing:
-        raise UserError(
-            f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
-            f"These are the names of the robot {robot.name!r}: choose embodiment=<the robot this dataset is of>, or "
-            "name its columns in a configs/embodiment file of your own. (RoboMME's poses and waypoints are columns of "
-            "datasets that this library converts or records.)"
-        )
+    raise_if(
+        missing,
+        f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
+        f"These are the names of the robot {robot.name!r}: choose embodiment=<the robot this dataset is of>, or "
+        "name its columns in a configs/embodiment file of your own. (RoboMME's poses and waypoints are columns of "
+        "datasets that this library converts or records.)",
+    )
     columns = {name: str(column) for name, column in matches.items()}
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
-        if features[column]["dtype"] not in ("image", "video"):
-            raise UserError(
-                f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be the camera "
-                f"{name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key)."
-            )
+        raise_if(
+            features[column]["dtype"] not in ("image", "video"),
+            f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be the camera "
+            f"{name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key).",
+        )
     state = tuple(columns[key] for key in robot.state.key or ("state",))
     action = tuple(columns[key] for key in robot.action.key or ("action",))
     _check_width(root, "state", state, features, robot.state.width, robot)
@@ -148,19 +148,19 @@ def resolve_root(root: str | Path) -> Path:
     """Return the dataset folder; `sample` names the one in the package."""
     path = SAMPLE if str(root) == "sample" else Path(root).expanduser()
     info = path / "meta" / "info.json"
-    if not info.is_file():
-        raise UserError(
-            f"No LeRobot dataset at {str(root)!r} (there is no {info}). Give its local folder, or 'sample'. From the "
-            "hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir <folder>`; from HDF5 files: "
-            "`mme-vla convert input=<files> output=<folder>`."
-        )
+    raise_if(
+        not info.is_file(),
+        f"No LeRobot dataset at {str(root)!r} (there is no {info}). Give its local folder, or 'sample'. From the "
+        "hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir <folder>`; from HDF5 files: "
+        "`mme-vla convert input=<files> output=<folder>`.",
+    )
     version = brief(read_info(path).get("codebase_version", "unknown"), quote=False)
-    if not version.startswith("v3."):
-        raise UserError(
-            f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own command: "
-            f"`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name} --root={path} "
-            "--push-to-hub=false`."
-        )
+    raise_if(
+        not version.startswith("v3."),
+        f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own command: "
+        f"`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name} --root={path} "
+        "--push-to-hub=false`.",
+    )
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not any(path.glob(pattern)):
             raise UserError(f"{path} has no {pattern}: the dataset is incomplete. Copy, download or convert it again.")
@@ -225,10 +225,7 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
             raise UserError(f"{file} says {brief(pair[1])} of episode {brief(pair[0])}. {expected}")
     table = dict(pairs)
     lost = [episode for episode in range(episodes) if episode not in table]
-    if lost:
-        raise UserError(
-            f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all {episodes}."
-        )
+    raise_if(lost, f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all {episodes}.")
     return np.array([table[episode] for episode in range(episodes)], np.int64)
 
 
@@ -283,10 +280,10 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
         empty = [name for name in schema.names if table[name].null_count]
         columns = {name: table[name].to_numpy() for name, _ in fields}
         tasks = [texts[0] if texts else None for texts in table["tasks"].to_pylist()]
-    if empty or not table.num_rows:
-        raise UserError(
-            f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}. {REMEDY}"
-        )
+    raise_if(
+        empty or not table.num_rows,
+        f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}. {REMEDY}",
+    )
     starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]
     checks = {
         "episode_index": (columns["episode_index"] == np.arange(len(starts)), "0, 1, 2, …"),

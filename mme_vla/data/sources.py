@@ -10,7 +10,7 @@ import numpy as np
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, raise_if
 
 
 @dataclass(frozen=True)
@@ -33,23 +33,22 @@ def split_episodes(
     """
     named = _by_source(val_episodes or [], sources)
     unknown = set(named) - {source.name for source in sources}
-    if unknown:
-        raise UserError(
-            f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
-            f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[]."
-        )
-    if not 0 <= val_fraction < 1:
-        raise UserError(f"val_fraction={val_fraction} must lie in [0, 1).")
+    raise_if(
+        unknown,
+        f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
+        f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[].",
+    )
+    raise_if(not 0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
     split = Split([], [])
     for source in sources:
         episodes = np.arange(len(source))
         if source.name in named:
             wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
-            if wrong:
-                raise UserError(
-                    f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
-                    "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1"
-                )
+            raise_if(
+                wrong,
+                f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
+                "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1",
+            )
             held_out = np.isin(episodes, named[source.name])
         else:
             held_out = np.array([_fraction(f"{source.name}/{e}") < val_fraction for e in episodes], bool)
@@ -94,16 +93,13 @@ def open_sources(
     `robot` says which columns hold its images, states and actions.
     """
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
-    if not listed:
-        raise UserError("data.sources is empty: name at least one dataset folder, or 'sample'.")
+    raise_if(not listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
     sources = []
     for entry in listed:
         options = {"root": entry} if isinstance(entry, str) else dict(entry)
         for key in options:
-            if key not in _KEYS:
-                raise UserError(f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
-        if not options.get("root"):
-            raise UserError("A data source needs its dataset folder: root=<folder>, or 'sample'.")
+            raise_if(key not in _KEYS, f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
+        raise_if(not options.get("root"), "A data source needs its dataset folder: root=<folder>, or 'sample'.")
         sources.append(EpisodeSource(**options, robot=robot))
     names = [source.name for source in sources]
     if len(set(names)) < len(names):

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, raise_if
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
 MOST_OBJECTS = 2**20  # values of a message, whatever holds them; a frame with all its cameras takes about 130
@@ -23,7 +23,6 @@ except ImportError as error:  # the extra is missing: say which
 
 
 def pack(message: Any) -> bytes:
-    """Encode a message."""
     try:
         packed = msgpack.packb(message, default=_encode)
     except (TypeError, ValueError, OverflowError) as error:
@@ -120,11 +119,11 @@ def _decode(fields: dict[Any, Any]) -> Any:
 
 
 def _array(fields: dict[Any, Any]) -> np.ndarray:
-    dtype, shape, data = _dtype(fields), fields.get(b"shape"), fields.get(b"data")
+    dtype = _dtype(fields)
+    shape, data = (fields.get(name) for name in (b"shape", b"data"))
     if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
         raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
-    if not isinstance(data, bytes):
-        raise UserError(f"An array's data must be bytes, got {type(data).__name__}.")
+    raise_if(not isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")
     needed = math.prod(shape) * dtype.itemsize
     if len(data) != needed:
         raise UserError(f"An array {dtype} {shape} takes {needed} bytes, but {len(data)} were sent.")

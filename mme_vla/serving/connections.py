@@ -52,7 +52,6 @@ class Connection:
         return self.in_request or (self.websocket and not self.transport.is_closing())
 
     def expire_in(self, seconds: float | None) -> None:
-        """Set the deadline; None for no deadline."""
         self.deadline = None if seconds is None else time.monotonic() + seconds
 
     def set_busy(self, busy: bool) -> None:
@@ -82,7 +81,6 @@ class Connections:
         self.stopping = False
 
     def arrive(self, transport: asyncio.Transport) -> Connection:
-        """Add a new connection."""
         unauthenticated = [known for known in self.open.values() if not (known.admitted or known.busy)]
         if len(unauthenticated) >= MAX_UNAUTHENTICATED:
             oldest = min(unauthenticated, key=_silence)
@@ -125,7 +123,6 @@ class Connections:
         return True
 
     def forget(self, connection: Connection) -> None:
-        """Remove a connection that is closed."""
         if self.open.get(connection.address) is connection:
             del self.open[connection.address]
         self._count()
@@ -137,7 +134,6 @@ class Connections:
                 connection.close(code, reason)
 
     def abort(self) -> None:
-        """Cut off what is left."""
         for connection in list(self.open.values()):
             connection.transport.abort()
 

@@ -13,7 +13,7 @@ import numpy as np
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, raise_if
 
 POSE = (3, 4)
 DEEPEST = 32_767  # millimetres: the benchmark's depth is int16
@@ -65,8 +65,7 @@ def _reading(key: str, row: Any, shape: tuple[int, ...]) -> np.ndarray:
         got = f"{value.dtype} {list(value.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
         raise UserError(f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
     numbers = value.astype(np.float32).reshape(shape)
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{key} holds numbers that are not finite.")
+    raise_if(not np.isfinite(numbers).all(), f"{key} holds numbers that are not finite.")
     return numbers
 
 
@@ -130,31 +129,29 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     Args:
         most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
     """
-    if not isinstance(message, dict):
-        raise UserError(f"A request is a map, got {type(message).__name__}.")
+    raise_if(not isinstance(message, dict), f"A request is a map, got {type(message).__name__}.")
     space_name = robot.action.answers
     space = message.get("action_space", space_name)
-    if space != space_name:
-        raise UserError(f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
+    raise_if(space != space_name, f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
-    if robot.action.of_pose and "action_space" not in message:
-        raise UserError(
-            f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
-            f"send action_space={space_name!r} in the request to confirm it."
-        )
+    raise_if(
+        robot.action.of_pose and "action_space" not in message,
+        f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
+        f"send action_space={space_name!r} in the request to confirm it.",
+    )
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames, robot)
     if any(isinstance(key, str) and key.startswith("observation/") for key in message):
         return _observation(message, robot)
     keys = [key for key in message if isinstance(key, str)][:10]
-    if keys and set(keys) <= set(KNOWN):  # flags: true was handled above
-        raise UserError(
-            f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
-            "keys observation/image, … or front_rgb_list, …"
-        )
+    raise_if(
+        keys and set(keys) <= set(KNOWN),
+        f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
+        "keys observation/image, … or front_rgb_list, …",
+    )
     unknown = [key for key in keys if key not in KNOWN]
     near = did_you_mean(unknown[0], KNOWN) if unknown else f"Known: {', '.join(KNOWN)}."
     raise UserError(f"No known request has the keys {keys}. {near}")
@@ -171,11 +168,11 @@ def _flag(message: dict[Any, Any], key: str) -> bool:
 
 
 def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> AddBuffer:
-    if robot.readings:
-        raise UserError(
-            f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
-            "past frames in the challenge's lists, and the current one in either schema."
-        )
+    raise_if(
+        robot.readings,
+        f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
+        "past frames in the challenge's lists, and the current one in either schema.",
+    )
     images = _array(message, "images")
     if images.ndim != 5 or images.shape[1] != 1:
         raise UserError(f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype} {list(images.shape)}.")
@@ -183,13 +180,15 @@ def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) ->
     frames = _frames("images", list(images[:, 0]), most_frames)
     states = _numbers("state", _array(message, "state"))
     width = robot.state.width
-    if states.shape != (count, width):
-        raise UserError(f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}.")
+    raise_if(
+        states.shape != (count, width), f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}."
+    )
     start = message.get("exec_start_idx", 0)
     if isinstance(start, np.integer):
         start = int(start)
-    if type(start) is not int or start < 0:
-        raise UserError(f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.")
+    raise_if(
+        type(start) is not int or start < 0, f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}."
+    )
     return AddBuffer(frames, start, states)
 
 
@@ -209,8 +208,9 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
-    if robot.action.space is None:
-        raise UserError(f"The robot {robot.name!r} is not the benchmark's: send observation/… messages.")
+    raise_if(
+        robot.action.space is None, f"The robot {robot.name!r} is not the benchmark's: send observation/… messages."
+    )
     keys = {name: f"{name}_rgb_list" for name in robot.camera_names}
     views = {name: _frames(key, _get(message, key), most_frames) for name, key in keys.items()}
     sizes = (("joint_state_list", ARM_JOINTS), ("gripper_state_list", 2))
@@ -221,8 +221,9 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
         counts = ", ".join(f"{key} has {length}" for key, length in lengths.items())
         raise UserError(f"All lists need one entry a frame: {counts}.")
     first = _get(message, "is_first_step")
-    if not isinstance(first, bool | np.bool_):
-        raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
+    raise_if(
+        not isinstance(first, bool | np.bool_), f"is_first_step must be true or false, got {type(first).__name__}."
+    )
     goal = _text("task_goal", _get(message, "task_goal"))
     states = np.stack([benchmark_state(*proprio) for proprio in zip(joints, grippers, strict=True)])
     images = {name: view[-1] for name, view in views.items()}
@@ -257,18 +258,15 @@ def _array(message: dict[Any, Any], key: str) -> np.ndarray:
             value = np.asarray(value)
         except (ValueError, TypeError, OverflowError):
             value = None
-    if not isinstance(value, np.ndarray):
-        raise UserError(f"{key} must be an array.")
+    raise_if(not isinstance(value, np.ndarray), f"{key} must be an array.")
     return value
 
 
 def _numbers(key: str, value: np.ndarray) -> np.ndarray:
-    if value.dtype.kind not in "fiu":
-        raise UserError(f"{key} must hold numbers, got dtype {value.dtype}.")
+    raise_if(value.dtype.kind not in "fiu", f"{key} must hold numbers, got dtype {value.dtype}.")
     with np.errstate(over="ignore"):
         numbers = value.astype(np.float32)
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{key} holds numbers that are not finite.")
+    raise_if(not np.isfinite(numbers).all(), f"{key} holds numbers that are not finite.")
     return numbers
 
 
@@ -276,27 +274,24 @@ def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
     rows = _get(message, key)
     if isinstance(rows, np.ndarray):
         rows = list(rows) if rows.ndim else None
-    if not isinstance(rows, list):
-        raise UserError(f"{key} must be a list of arrays [{size}].")
+    raise_if(not isinstance(rows, list), f"{key} must be a list of arrays [{size}].")
     arrays = [_numbers(key, _array({key: row}, key)) for row in rows]
     for row in arrays:
-        if row.shape != (size,):
-            raise UserError(f"{key} must hold arrays [{size}], got {list(row.shape)}.")
+        raise_if(row.shape != (size,), f"{key} must hold arrays [{size}], got {list(row.shape)}.")
     return arrays
 
 
 def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
-    if not isinstance(frames, list):
-        raise UserError(f"{key} must be a list of uint8 images [height, width, 3].")
-    if not 1 <= len(frames) <= most:
-        raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
+    raise_if(not isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
+    raise_if(
+        not 1 <= len(frames) <= most, f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames)."
+    )
     for frame in frames:
         _image(key, frame)
     shapes = {frame.shape for frame in frames}
-    if len(shapes) > 1:
-        raise UserError(f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
+    raise_if(len(shapes) > 1, f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
 
 
@@ -318,8 +313,7 @@ def _text(key: str, value: Any) -> str:
         value = value[0]  # the benchmark gives a goal as a list of wordings
     if not isinstance(value, str):
         raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
-    if len(value) > MOST_GOAL:
-        raise UserError(f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
+    raise_if(len(value) > MOST_GOAL, f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
     if any("\ud800" <= character <= "\udfff" for character in value):
         raise UserError(f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
     return str(value)

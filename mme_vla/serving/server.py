@@ -79,7 +79,6 @@ class PolicyServer:
         self._uvicorn: uvicorn.Server | None = None
 
     async def start(self) -> None:
-        """Warm up, then accept clients."""
         begun = time.perf_counter()
         await self.engine.call(lambda: warm_up(self.engine.policy, self.settings))
         logger.info("warmed up in %.1f s", time.perf_counter() - begun)
@@ -144,7 +143,6 @@ class PolicyServer:
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
-    """The first message to a client."""
     limits = settings.limits
     return {
         "server": "mme_vla",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import benchmark_action
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, raise_if
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import unpack
 from mme_vla.serving.engine import Engine
@@ -154,11 +154,11 @@ class Session:
 
     def _check_capacity(self, count: int) -> None:
         total, most = self.episode.n_observed_frames + count, self._settings.limits.frames
-        if total > most:
-            raise UserError(
-                f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
-                "episodes."
-            )
+        raise_if(
+            total > most,
+            f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
+            "episodes.",
+        )
 
     @property
     def _reads_past_actions(self) -> bool:
@@ -202,13 +202,7 @@ class HttpSessions:
         self.entries: dict[Name, SessionEntry] = {}
 
     async def respond(self, name: Name, request: Request, begun: float) -> dict[str, Any]:
-        """Answer a request of a session, after those of the same session that came before.
-
-        Raises:
-            NoEpisodeError: the request continues with an episode that is not here.
-            BusyError: a new session, and no place for it.
-            UserError: the request does not fit the episode, which ends with it, as it does with any other error.
-        """
+        """Answer a request of a session, after those of the same session that came before."""
         entry = self.find(name, request)
         entry.requests += 1
         try:

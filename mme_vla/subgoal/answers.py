@@ -28,7 +28,6 @@ class SubgoalHistory:
         return True
 
     def add_parsed(self, parsed: Parsed) -> bool:
-        """Note a parsed answer."""
         return self.add(parsed.entry, parsed.points)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import raise_if
 from mme_vla.processing.prompt import POINT
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
@@ -204,12 +204,10 @@ class GeminiEpisode(SubgoalEpisode):
         self.again = False
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take frames, see `SubgoalEpisode`; they wait for the next question."""
         super().observe(frames, info)
         self.unseen += list(frames)
 
     def next_message(self) -> list[Any]:
-        """The parts of the next question."""
         if self.messages:
             return self._since(self.unseen)
         video = [MediaPart(self.video)] if len(self.video) else []
@@ -249,16 +247,13 @@ class Gemini(SubgoalPredictor):
         **settings: Any,
     ) -> None:
         super().__init__(kind, interval)
-        if workers < 1:
-            raise UserError(f"workers={workers} must be at least 1: questions under way at once.")
-        if wait < 0:
-            raise UserError(f"wait={wait} must be a number of steps, 0 or more.")
+        raise_if(workers < 1, f"workers={workers} must be at least 1: questions under way at once.")
+        raise_if(wait < 0, f"wait={wait} must be a number of steps, 0 or more.")
         self.wait, self.workers = wait, workers
         self.api = make_api(self.provider, settings, "subgoal", self.usage, client)
         self._lock = threading.Lock()
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> GeminiEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
         return GeminiEpisode(goal, video, task)
 
     def due(self, episode: SubgoalEpisode) -> bool:
@@ -269,7 +264,6 @@ class Gemini(SubgoalPredictor):
         return super().due(episode) and not (episode.task in LATE and self.due_step(episode) < self.wait)
 
     def predict_due(self, episodes: Sequence[GeminiEpisode]) -> list[Subgoal]:
-        """Ask for all of them, some at a time."""
         return side_by_side(self._ask, episodes, self.workers)
 
     def _ask(self, episode: GeminiEpisode) -> Subgoal:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, raise_if
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.gemini import example_of, what_there_is
@@ -91,11 +91,9 @@ class Count:
     value: int
 
     def to_dict(self) -> dict[str, Any]:
-        """As a model writes it, without the name."""
         return {"kind": "count", "value": self.value}
 
     def check(self, before: "Count | None", finished: bool) -> None:
-        """See `Notebook.written`."""
         if before is not None and not before.value <= self.value <= before.value + finished:
             raise MalformedReply(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
 
@@ -107,7 +105,6 @@ class Identity:
     words: str
 
     def to_dict(self) -> dict[str, Any]:
-        """As a model writes it, without the name."""
         return {"kind": "identity", "words": self.words}
 
     def check(self, before: "Identity | None", finished: bool) -> None:
@@ -122,11 +119,9 @@ class Route:
     done: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """As a model writes it, without the name."""
         return {"kind": "route", "steps": list(self.steps), "done": self.done}
 
     def check(self, before: "Route | None", finished: bool) -> None:
-        """See `Notebook.written`."""
         if self.done > len(self.steps):
             raise MalformedReply(f"{self.done} of {len(self.steps)} steps cannot be done")
         if before is not None and before.steps != self.steps:
@@ -150,9 +145,6 @@ class Notebook:
 
         Args:
             finished: the subgoal that was just completed; None where notes are taken before anything was done.
-
-        Raises:
-            MalformedAnswer: an entry changes in a way that its kind does not; nothing is written then.
         """
         notes = dict(self.notes)
         for name, note in entries:
@@ -181,11 +173,7 @@ class Notebook:
 
 
 def read_notes(entries: Any) -> list[tuple[str, Note]]:
-    """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has.
-
-    Raises:
-        MalformedAnswer: something else.
-    """
+    """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise MalformedReply("notes is not a list of objects")
     return [(_words(entry.get("name"), "name"), _read(entry)) for entry in entries[: MOST_NOTES + 1]]
@@ -236,7 +224,6 @@ class NotebookEpisode(SubgoalEpisode):
         self.agreed = False
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take frames, see `SubgoalEpisode`."""
         super().observe(frames, info)
         self.since = [*self.since, *frames][-LONGEST:]
 
@@ -271,18 +258,15 @@ class NotebookPredictor(SubgoalPredictor):
         **settings: Any,
     ) -> None:
         super().__init__(kind, interval)
-        if workers < 1:
-            raise UserError(f"workers={workers} must be at least 1: questions under way at once.")
+        raise_if(workers < 1, f"workers={workers} must be at least 1: questions under way at once.")
         self.workers = workers
         self.api = make_api(api, settings, "subgoal", self.usage, client)
         self._lock = threading.Lock()
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> NotebookEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
         return NotebookEpisode(goal, video, task)
 
     def predict_due(self, episodes: Sequence[NotebookEpisode]) -> list[Subgoal]:
-        """Ask for all of them, some at a time."""
         return side_by_side(self._ask, episodes, self.workers)
 
     def _ask(self, episode: NotebookEpisode) -> Subgoal:

@@ -59,7 +59,6 @@ def numbered(history: Sequence[str]) -> str:
 
 
 def memer_system() -> str:
-    """The system prompt of MemER."""
     return _MEMER_SYSTEM
 
 
@@ -151,11 +150,7 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
 
 
 def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
-    """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points.
-
-    Raises:
-        MalformedAnswer: nothing in it, a damaged point, or one outside the image.
-    """
+    """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points."""
     text = " ".join(reply.split())
     if not text:
         raise MalformedReply("the answer is empty")
@@ -179,9 +174,6 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
 
     Returns:
         The subgoal and the positions, from 1, in ascending order.
-
-    Raises:
-        MalformedAnswer: no JSON object, no subtask, or positions that are no list of whole numbers.
     """
     fields = json_object(reply)
     subtask, positions = fields.get("current_subtask"), fields.get("keyframe_positions", [])
@@ -196,9 +188,6 @@ def parse_gemini(reply: str) -> str:
     """Return the subgoal of a prompted model's reply, points still in thousandths.
 
     The first quoted string after a `"subgoal"` key on that line counts; failing that, the answer read as JSON.
-
-    Raises:
-        MalformedAnswer: there is none.
     """
     for remainder in _SUBGOAL_KEY.findall(reply):
         quoted = _QUOTED.search(remainder)
@@ -211,11 +200,7 @@ def parse_gemini(reply: str) -> str:
 
 
 def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
-    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side].
-
-    Raises:
-        MalformedAnswer: a number is too long to be read.
-    """
+    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side]."""
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
@@ -241,16 +226,11 @@ def mark_points(text: str) -> tuple[str, list[Point]]:
 
 
 def points_of(text: str) -> tuple[Point, ...]:
-    """The points `at <y, x>` of a text."""
     return tuple((int(y), int(x)) for y, x in _PIXELS.findall(text))
 
 
 def json_object(reply: str) -> dict[str, object]:
-    """The outermost braces of an answer as JSON.
-
-    Raises:
-        MalformedAnswer: there are none, or something else between them.
-    """
+    """The outermost braces of an answer as JSON."""
     start, stop = reply.find("{"), reply.rfind("}")
     if start < 0 or stop < start:
         raise MalformedReply("the answer holds no JSON object")

@@ -19,10 +19,6 @@ def check_backbone(name: str, **sizes: Any) -> None:
 
     Args:
         name: the key in `BACKBONES`. sizes: small ones, as its YAML would give them.
-
-    Raises:
-        AssertionError: names the property that does not hold, and the values.
-        UserError: an unknown backbone or size.
     """
     kind: type[Backbone] = BACKBONES[name]
     with torch.random.fork_rng(devices=[]):

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, raise_if
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 from mme_vla.utils import read_lines, write_atomically
@@ -38,7 +38,6 @@ class Window:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew."""
         self._sums: dict[str, Tensor | float] = {}
         self._counts: dict[str, int] = {}
         self._updates = 0
@@ -81,12 +80,12 @@ class Window:
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds
         values["speed/waiting_for_data"] = self._waited / seconds
         broken = [name for name, value in values.items() if not math.isfinite(value)]
-        if broken:
-            raise UserError(
-                f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was saved. "
-                "Resume from the last checkpoint with a lower train.lr in a new run (init_from=…), "
-                "or look for broken values in the data (python -m mme_vla.inspect dataset=…)."
-            )
+        raise_if(
+            broken,
+            f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was saved. "
+            "Resume from the last checkpoint with a lower train.lr in a new run (init_from=…), "
+            "or look for broken values in the data (python -m mme_vla.inspect dataset=…).",
+        )
         self.restart()
         return values
 
@@ -115,12 +114,10 @@ class ProgressLine:
             self._bar.stop()
 
     def advance(self) -> None:
-        """One update is done."""
         if self._bar is not None:
             self._bar.advance(self._task)
 
     def numbers(self, step: int, values: Mapping[str, float]) -> None:
-        """Show the latest training numbers."""
         text = (
             f"loss {values['train/loss']:.4f} · lr {values['train/lr']:.1e} · grad {values['train/grad_norm']:.2f} · "
             f"{values['speed/samples_per_s']:.1f} samples/s · {values['memory/gib']:.1f} GiB"
@@ -131,7 +128,6 @@ class ProgressLine:
             self.console.print(f"step {step}/{self._total} · {text}", markup=False)
 
     def say(self, text: str) -> None:
-        """Print a line that stays."""
         self.console.print(text, markup=False)
 
 
@@ -235,7 +231,6 @@ class Loggers:
         self._file, self._tracker = file, tracker
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record values after `step` updates."""
         if self._file is not None:
             self._file.write(json.dumps({"step": step, **values}) + "\n")
         if self._tracker is not None:
@@ -254,7 +249,6 @@ class Loggers:
                 tracker.log_artifact(str(path))
 
     def close(self) -> None:
-        """Write or send everything."""
         if self._file is not None:
             self._file.close()
         if self._tracker is not None:
@@ -298,6 +292,5 @@ def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Lo
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`."""
     path = folder / METRICS
     return read_lines(path, dict, "metrics", finite=False) if path.exists() else []

@@ -117,7 +117,6 @@ class Trainer:
         """The signal that ended `run` early."""
 
     def describe(self) -> str:
-        """One line on what trains where."""
         total, trained = (sum(p.numel() for p in part) for part in (self.policy.parameters(), self._parameters))
         processes = f"{self.accelerator.num_processes} × " if self.accelerator.num_processes > 1 else ""
         return (

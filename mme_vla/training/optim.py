@@ -107,7 +107,6 @@ class EMA:
             average.copy_(like(average, tensors[name]))
 
     def tensors(self) -> dict[str, Tensor]:
-        """The averages by parameter name."""
         return dict(zip(self._parameters, self._average, strict=True))
 
     @contextmanager

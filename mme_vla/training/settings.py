@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, raise_if
 from mme_vla.speed.recompute import ALL, SELECTIVE, Recompute
 from mme_vla.training.parallel import ParallelSettings
 
@@ -105,5 +105,4 @@ class TrainSettings:
 
 
 def _check(name: str, value: Any, fits: bool, expected: str) -> None:
-    if not fits:
-        raise UserError(f"train.{name}={value!r} must be {expected}.")
+    raise_if(not fits, f"train.{name}={value!r} must be {expected}.")

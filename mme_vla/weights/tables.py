@@ -13,7 +13,7 @@ from einops import rearrange
 from torch import Tensor
 
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, listed, raise_if
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import check_fit
 
@@ -88,8 +88,7 @@ def linear(path: str, *, layer: int | None = None, bias: bool = True) -> NameTab
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Translate a foreign checkpoint into our names and layouts."""
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
-    if missing:
-        raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
+    raise_if(missing, f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
     target = {}
     for name, pieces in table.items():
         try:
@@ -106,11 +105,11 @@ def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
     for constant in derived:
         if constant.path in source:
             stored, expected = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
-            if stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2):
-                raise UserError(
-                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
-                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here."
-                )
+            raise_if(
+                stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
+                f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
+                f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here.",
+            )
 
 
 def write(
@@ -163,11 +162,11 @@ class Adapter:
     def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Write our tensors in the foreign names and layouts, the three lists included."""
         homeless = sorted(set(target) - set(self.table))
-        if homeless:
-            raise UserError(
-                f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
-                "policies without adapters: convert another policy, merge the adapters first, or choose another format."
-            )
+        raise_if(
+            homeless,
+            f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
+            "policies without adapters: convert another policy, merge the adapters first, or choose another format.",
+        )
         released = write(self.table, self.unread, target, self.derived)
         return released | {name: released[original] for name, original in self.tied.items()}
 

@@ -5,7 +5,6 @@ import re
 import socket
 import threading
 import time
-import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -17,7 +16,7 @@ from websockets.sync.client import connect
 
 from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, observation, serving_policy, states
 from mme_vla.errors import UserError
-from mme_vla.serving import Limits, ServeSettings, connections, pack, unpack
+from mme_vla.serving import Limits, connections, pack, unpack
 
 PICTURE = np.zeros((16, 16, 3), np.uint8)
 EPISODES, LIVE, PLACES = 800, 16, 64
@@ -210,15 +209,3 @@ def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeyp
     assert "broken" in failure
     for chunk in chunks:
         np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_an_empty_key_is_none():
-    assert ServeSettings.from_dict({"api_key": ""}).api_key is None
-    assert ServeSettings.from_dict({"api_key": "right"}).api_key == "right"
-
-
-def test_the_client_uses_nothing_that_is_about_to_go(policy):
-    with Served(policy) as served, warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with served.client() as client:
-            assert client.reset()["reset_finished"] is True

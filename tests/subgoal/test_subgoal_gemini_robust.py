@@ -21,12 +21,6 @@ def test_late_tasks_leave_out_what_came_due_before_their_step():
     assert queries == [0, 100], "the question of step 48 is left out, the one of step 96 is asked at 100"
 
 
-def test_a_point_that_cannot_be_read_is_counted_and_survived():
-    predictor, _ = predictor_of(says("press"), says(f"move to <{'9' * 5000}, 3>"))
-    subgoals, _ = play(predictor, started(predictor), 4)
-    assert (subgoals[3].text, subgoals[3].problem) == ("press", "malformed")
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [("timeout", 0), ("timeout", "soon"), ("retries", -1), ("retries", 1.5), ("backoff", -1), ("temperature", -0.1),

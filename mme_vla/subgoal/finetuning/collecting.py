@@ -22,7 +22,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, raise_if
 from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
@@ -80,8 +80,7 @@ def build(
 ) -> dict[str, int]:
     """Build these sets; return the number of rows of each."""
     options = options or RowOptions()
-    if not episodes or not sets:
-        raise UserError("There is nothing to build: name at least one episode and one of the sets.")
+    raise_if(not episodes or not sets, "There is nothing to build: name at least one episode and one of the sets.")
     names = [episode.name for episode in episodes]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
@@ -94,11 +93,11 @@ def build(
 def _build(
     episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions, plan: dict[str, Any]
 ) -> dict[str, int]:
-    if not claim_plan(output, plan):
-        raise UserError(
-            f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
-            "repeat that command to finish it, or remove the folder yourself."
-        )
+    raise_if(
+        not claim_plan(output, plan),
+        f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
+        "repeat that command to finish it, or remove the folder yourself.",
+    )
     for folder in (output, *(path for path in output.rglob("*") if path.is_dir())):
         remove_drafts(folder)
     missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
@@ -186,11 +185,11 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
     demonstrations = []
     for e in range(len(source)):
         task = task_names.get(str(e)) or source.task(e)
-        if not task:
-            raise UserError(
-                f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
-                'tasks=<file> with {"<episode index>": "<Task>", …}.'
-            )
+        raise_if(
+            not task,
+            f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
+            'tasks=<file> with {"<episode index>": "<Task>", …}.',
+        )
         record = source.records[e] if e < len(source.records) else {}
         number = record.get("source_episode", e)
         if type(number) is not int or not 0 <= number < 2**31:

@@ -49,7 +49,6 @@ class Labels:
 
     @property
     def last(self) -> int:
-        """The last frame."""
         return self.length - 1
 
     def texts(self, kind: str) -> list[str]:

@@ -74,7 +74,6 @@ def _unread_layer(config: BackboneConfig, expert: ExpertConfig, suffix: str) -> 
 
 
 def _vision(config: BackboneConfig) -> NameTable:
-    """The table of timm's transformer, which keeps q, k and v in one matrix."""
     root, heads = "PaliGemma/img", config.vision.num_heads
     axes = {"n": heads, "h": config.vision.width // heads}
     table: NameTable = {
