@@ -10,7 +10,7 @@ import re
 from collections import OrderedDict
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError, brief, raise_if
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 from mme_vla.utils import Sums, decoding, files_to_hold, read_json, require_file, user_cache
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT = 1  # of the files below
 PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
@@ -150,8 +147,7 @@ class VisionCache:
         if episode in self._verified:
             return
         sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)
-        for name in sums.table:
-            sums.check(name)
+        sums.check(*sums.table)
         self._verified.add(episode)
 
     @property

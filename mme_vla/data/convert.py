@@ -213,7 +213,14 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
 def _convert(
     episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
 ) -> int:
-    _claim(partial, plan)
+    raise_if(
+        not claim_plan(partial, plan),
+        f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
+        "that one to finish it, choose another output, or remove that folder yourself.",
+    )
+    for leftover in (partial / "writing", partial / _MERGED):
+        shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
+    (partial / _PARTS).mkdir(exist_ok=True)
     names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
     parts = [partial / _PARTS / name for name in names]
     missing = [i for i, part in enumerate(parts) if not part.is_dir()]
@@ -233,31 +240,17 @@ def _finished(output: Path, plan: dict[str, Any]) -> bool:
     if not output.exists() or (output.is_dir() and not any(output.iterdir())):
         return False
     side = output / SIDE_FILE
-    if side.is_file() and _same(read_json(side, "the facts of a converted dataset").get("plan"), plan):
-        return True
+    if side.is_file():
+        stored = read_json(side, "the facts of a converted dataset").get("plan")
+        if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
+            # Plans from before contents were compared name files and sizes only.
+            plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
+        if stored == plan:
+            return True
     raise UserError(
         f"{output} exists and is not the result of this conversion (other files, other content of a file, other "
         "episodes or options). Choose another output, or remove that folder yourself."
     )
-
-
-def _same(stored: Any, plan: dict[str, Any]) -> bool:
-    """Whether a stored plan is this one; plans from before contents were compared name files and sizes only."""
-    if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
-        plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
-    return stored == plan
-
-
-def _claim(partial: Path, plan: dict[str, Any]) -> None:
-    """Make `partial` the work folder of this plan, or recognise it as such."""
-    raise_if(
-        not claim_plan(partial, plan),
-        f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
-        "that one to finish it, choose another output, or remove that folder yourself.",
-    )
-    for leftover in (partial / "writing", partial / _MERGED):
-        shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
-    (partial / _PARTS).mkdir(exist_ok=True)
 
 
 def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
@@ -353,6 +346,8 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
+    stats = merged / "meta" / "stats.json"  # LeRobot writes its keys in the order of a set, another in each process
+    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
     for i, part in enumerate(parts):
         if (part / _KEYFRAMES).is_file():
             file_of(merged, i).parent.mkdir(exist_ok=True)

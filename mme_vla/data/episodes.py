@@ -92,7 +92,10 @@ class EpisodeSource:
         self.lossy = {name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))}
         """Of cameras whose videos lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
-        self._check_tables()
+        # What every opening reads anyway; tables that hold images are left to `verify`.
+        opened = ("meta/", "data/") if len(videos) == len(self.columns) else ("meta/",)
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        sums.check(*(name for name in sums.table if name.startswith(opened)))
         episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
         self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
         self._goals = list(episodes["goals"])
@@ -155,16 +158,8 @@ class EpisodeSource:
             The number of files compared, 0 for a dataset that was written without checksums.
         """
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        for name in sums.table:
-            sums.check(name)
+        sums.check(*sums.table)
         return len(sums.table)
-
-    def _check_tables(self) -> None:
-        """The same for what every opening reads anyway; tables that hold images are left to `verify`."""
-        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        for name in sums.table:
-            if name.startswith("meta/") or (name.startswith("data/") and len(self.video_cameras) == len(self.columns)):
-                sums.check(name)
 
     def goal(self, episode: int) -> str:
         """The episode's goal in words, lower-case."""

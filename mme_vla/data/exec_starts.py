@@ -4,7 +4,7 @@
 is found among them by its goal, its length and its joint angles.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,22 +36,16 @@ def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
     """All episodes, in order, of official HDF5 files or their folders, and of LeRobot datasets that mark the video."""
     episodes: list[AnnotatedEpisode] = []
     for path in inputs:
-        annotated = _of_dataset(Path(path)) if (Path(path) / "meta").is_dir() else _of_files(path)
-        episodes += annotated
+        if (Path(path) / "meta").is_dir():
+            source = EpisodeSource(path)
+            for e, start in enumerate(source.exec_starts.tolist()):
+                episodes.append(AnnotatedEpisode((source.goal(e),), source.states(e)[:, :ARM_JOINTS], start))
+            continue
+        for ref in list_episodes(find_files([path])):
+            with open_episode(ref) as episode:
+                joints = episode.joints()[0].astype(np.float32)
+                episodes.append(AnnotatedEpisode(tuple(episode.goals), joints, episode.exec_start))
     return episodes
-
-
-def _of_dataset(root: Path) -> Iterator[AnnotatedEpisode]:
-    source = EpisodeSource(root)
-    for episode in range(len(source)):
-        joints = source.states(episode)[:, :ARM_JOINTS]
-        yield AnnotatedEpisode((source.goal(episode),), joints, int(source.exec_starts[episode]))
-
-
-def _of_files(path: str | Path) -> Iterator[AnnotatedEpisode]:
-    for ref in list_episodes(find_files([path])):
-        with open_episode(ref) as episode:
-            yield AnnotatedEpisode(tuple(episode.goals), episode.joints()[0].astype(np.float32), episode.exec_start)
 
 
 def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> list[int]:

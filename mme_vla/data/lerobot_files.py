@@ -33,7 +33,7 @@ NAMES: Mapping[str, Mapping[str, str]] = {
     },
 }
 """Spellings of a dataset's columns, each by how it differs from the released datasets'."""
-_DEFAULT_COLUMNS = {"state": ("observation.state",), "action": ("action", "actions")}
+_ACTION = ("action", "actions")
 
 
 @dataclass(frozen=True)
@@ -55,14 +55,13 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     """Match a robot with a dataset."""
     matches = {
         **{camera.name: _first(_spellings_of(camera), features) for camera in robot.cameras},
-        **{key: _first((key, f"observation.{key}"), features) for key in robot.state.key},
-        **{key: _first((key, *_also(key)), features) for key in robot.action.key},
-        **{key: _first((key, f"observation.{key}"), features) for key in robot.action.pose_key},
+        **{key: _first((key, f"observation.{key}"), features) for key in (*robot.state.key, *robot.action.pose_key)},
+        **{key: _first((key, *(_ACTION if key in _ACTION else ())), features) for key in robot.action.key},
     }
     if not robot.state.key:
         matches["state"] = _first(("observation.state", "state"), features)
     if not robot.action.key:
-        matches["action"] = _first(("action", "actions"), features)
+        matches["action"] = _first(_ACTION, features)
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
     missing = [keys.get(name, name) for name, column in matches.items() if column is None]
     raise_if(
@@ -118,10 +117,6 @@ def names_of(features: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
 def _spellings_of(camera: Camera) -> list[str]:
     names = [camera.key, camera.name] if camera.key else [camera.name]
     return [spelling for name in names for spelling in (name, f"observation.images.{name}")]
-
-
-def _also(key: str) -> tuple[str, ...]:
-    return tuple(name for name in _DEFAULT_COLUMNS["action"] if key in _DEFAULT_COLUMNS["action"] and name != key)
 
 
 def _first(names: Iterable[str], features: Mapping[str, Any]) -> str | None:
@@ -335,12 +330,13 @@ def _kind(dtype: str, shape: tuple[int, ...], **_: Any) -> Any:
 
 def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
     """Make sure that every row of a column is `width` finite numbers; one alone may stand without a list around it."""
+    import pyarrow as pa
     import pyarrow.compute as pc
 
-    first = 0
+    first, list_kinds = 0, (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
     for chunk in table.data[name].chunks:
         # Counting is not enough: rows of 7 and 9 numbers have 8 on average.
-        listed = _is_list(chunk.type)
+        listed = any(is_kind(chunk.type) for is_kind in list_kinds)
         lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False) if listed else width
         wrong = np.broadcast_to(lengths != width, len(chunk))
         if not wrong.any():
@@ -369,9 +365,3 @@ def video_file(root: Path, template: object, view: str, chunk: int, file: int) -
             f"{{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
         )
     return inside(root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video")
-
-
-def _is_list(kind: Any) -> bool:
-    import pyarrow as pa
-
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)

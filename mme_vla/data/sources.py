@@ -51,7 +51,8 @@ def split_episodes(
             )
             held_out = np.isin(episodes, named[source.name])
         else:
-            held_out = np.array([_fraction(f"{source.name}/{e}") < val_fraction for e in episodes], bool)
+            sums = (sha256(f"{source.name}/{e}".encode()).digest()[:8] for e in episodes)
+            held_out = np.array([int.from_bytes(number, "big") / 2**64 < val_fraction for number in sums], bool)
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
     if not sum(map(len, split.train)):
@@ -76,10 +77,6 @@ def _by_source(names: Sequence[int | str], sources: Sequence[EpisodeSource]) -> 
             )
         grouped.setdefault(source or sources[0].name, []).append(int(number))
     return grouped
-
-
-def _fraction(text: str) -> float:
-    return int.from_bytes(sha256(text.encode()).digest()[:8], "big") / 2**64
 
 
 _KEYS = ("root", "name", "exec_starts")

@@ -120,7 +120,8 @@ def _decode(fields: dict[Any, Any]) -> Any:
 
 def _array(fields: dict[Any, Any]) -> np.ndarray:
     dtype = _dtype(fields)
-    shape, data = (fields.get(name) for name in (b"shape", b"data"))
+    shape: Any = fields.get(b"shape")
+    data: Any = fields.get(b"data")
     if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
         raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
     raise_if(not isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")

@@ -83,7 +83,7 @@ class Connections:
     def arrive(self, transport: asyncio.Transport) -> Connection:
         unauthenticated = [known for known in self.open.values() if not (known.admitted or known.busy)]
         if len(unauthenticated) >= MAX_UNAUTHENTICATED:
-            oldest = min(unauthenticated, key=_silence)
+            oldest = min(unauthenticated, key=lambda known: known.silent_since)
             oldest.transport.abort()
             self.forget(oldest)
         address = tuple((transport.get_extra_info("peername") or (id(transport), 0))[:2])
@@ -114,7 +114,7 @@ class Connections:
             silent = [known for known in admitted if not known.busy]
             if not silent:
                 return False
-            oldest = min(silent, key=lambda known: (known.websocket, _silence(known)))
+            oldest = min(silent, key=lambda known: (known.websocket, known.silent_since))
             oldest.admitted = False
             oldest.close(1001, FULL)
             self._stats.count("let_go")
@@ -164,10 +164,6 @@ class Connections:
 
     def _count(self) -> None:
         self._stats.connections = sum(known.admitted for known in self.open.values())
-
-
-def _silence(connection: Connection) -> float:
-    return connection.silent_since
 
 
 def timed_protocol(connections: Connections) -> type[H11Protocol]:

@@ -14,6 +14,7 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
 from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.utils import is_text
 
 POSE = (3, 4)
 DEEPEST = 32_767  # millimetres: the benchmark's depth is int16
@@ -52,21 +53,17 @@ def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple
     if rows is None or len(rows) != count:
         got = type(value).__name__ if rows is None else f"{len(rows)} entries"
         raise UserError(f"{key} must have one entry for each of {count} frames, got {got}.")
-    return np.stack([_reading(key, row, shape) for row in rows])
-
-
-def _reading(key: str, row: Any, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        value = np.asarray(row)
-        fits = value.dtype.kind in "fiu" and value.shape in (shape, (*shape, 1))
-    except ValueError:  # rows of different lengths
-        fits = False
-    if not fits:
-        got = f"{value.dtype} {list(value.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
-        raise UserError(f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
-    numbers = value.astype(np.float32).reshape(shape)
-    raise_if(not np.isfinite(numbers).all(), f"{key} holds numbers that are not finite.")
-    return numbers
+    readings = []
+    for row in rows:
+        try:
+            array = np.asarray(row)
+        except ValueError:  # rows of different lengths
+            array = np.empty(0, object)
+        fits = array.dtype.kind in "fiu" and array.shape in (shape, (*shape, 1))
+        got = f"{array.dtype} {list(array.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
+        raise_if(not fits, f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
+        readings.append(_numbers(key, array).reshape(shape))
+    return np.stack(readings)
 
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
@@ -284,28 +281,27 @@ def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
 def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
-    raise_if(not isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
-    raise_if(
-        not 1 <= len(frames) <= most, f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames)."
-    )
-    for frame in frames:
-        _image(key, frame)
-    shapes = {frame.shape for frame in frames}
+    if not isinstance(frames, list):
+        raise UserError(f"{key} must be a list of uint8 images [height, width, 3].")
+    if not 1 <= len(frames) <= most:
+        raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
+    shapes = {_image(key, frame).shape for frame in frames}
     raise_if(len(shapes) > 1, f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
 
 
 def _image(key: str, image: Any) -> np.ndarray:
-    if not isinstance(image, np.ndarray):
-        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {type(image).__name__}.")
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[-1] != 3:
-        got = f"{image.dtype} {list(image.shape)}"
-        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {got}.")
-    if not all(SIDES[0] <= side <= SIDES[1] for side in image.shape[:2]):
-        raise UserError(f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(image.shape[:2])}.")
-    if max(image.shape[:2]) > 8 * min(image.shape[:2]):
-        raise UserError(f"{key}: an image of {list(image.shape[:2])} is too narrow to be scaled into a square.")
-    return image
+    array = isinstance(image, np.ndarray)
+    got = f"{image.dtype} {list(image.shape)}" if array else type(image).__name__
+    fits = array and image.dtype == np.uint8 and image.ndim == 3 and image.shape[-1] == 3
+    raise_if(not fits, f"{key} must be a uint8 image [height, width, 3], got {got}.")
+    low, high = sorted(image.shape[:2])
+    raise_if(
+        low < SIDES[0] or high > SIDES[1], f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}."
+    )
+    raise_if(high > 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
+    checked: np.ndarray = image
+    return checked
 
 
 def _text(key: str, value: Any) -> str:
@@ -314,6 +310,5 @@ def _text(key: str, value: Any) -> str:
     if not isinstance(value, str):
         raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
     raise_if(len(value) > MOST_GOAL, f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
-    if any("\ud800" <= character <= "\udfff" for character in value):
-        raise UserError(f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
+    raise_if(not is_text(value), f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
     return str(value)

@@ -82,6 +82,7 @@ class Session:
 
     async def _infer(self, request: Infer) -> np.ndarray:
         policy = self._engine.policy
+        reads_actions = policy.require_processor().prompt_spec.past_actions > 0
         if request.first:
             self._begin()  # a client that repeats its first request means the same episode, not a longer one
         elif request.first is not None and self.episode.n_observed_frames == 0:
@@ -97,7 +98,7 @@ class Session:
             self._check_capacity(len(request.frames))
             if request.first:
                 self._exec_start = len(request.frames) - 1
-        elif self._reads_past_actions and self._n_frames_at_action == self.episode.n_observed_frames:
+        elif reads_actions and self._n_frames_at_action == self.episode.n_observed_frames:
             raise UserError(
                 "This policy reads which actions were executed, one a frame: send the frames since the last chunk with "
                 "add_buffer before the observation."
@@ -159,10 +160,6 @@ class Session:
             f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
             "episodes.",
         )
-
-    @property
-    def _reads_past_actions(self) -> bool:
-        return self._engine.policy.require_processor().prompt_spec.past_actions > 0
 
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""

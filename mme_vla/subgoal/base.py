@@ -127,6 +127,7 @@ class SubgoalPredictor:
     """Whether `start_episode` has to be given the images of a conditioning video."""
     sees_passing = True
     """Whether frames are looked at besides those at which `predict` is called."""
+    episode_type: type[SubgoalEpisode] = SubgoalEpisode
 
     def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
         raise_if(kind not in KINDS, f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
@@ -142,7 +143,7 @@ class SubgoalPredictor:
             goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first execution frame.
             task: its name (`ButtonUnmask`), for rules that hold for some tasks.
         """
-        return SubgoalEpisode(goal, video, task)
+        return self.episode_type(goal, video, task)
 
     def predict(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
         """The subgoals of these episodes at their current frames; those that are due are asked in one batch.

@@ -1,17 +1,16 @@
 """`notebook`: a prompted model that watches for completion, and takes typed notes only when it has seen it."""
 
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import brief, raise_if
+from mme_vla.errors import brief
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.gemini import example_of, what_there_is
-from mme_vla.subgoal.models.api import ApiFailure, make_api, side_by_side
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
+from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
+from mme_vla.subgoal.models.api import ApiFailure
 from mme_vla.subgoal.models.connection import MediaPart
 from mme_vla.subgoal.text import MalformedReply, json_object, parse_gemini, pixels_of_pairs, says_done
 from mme_vla.utils import is_text
@@ -90,9 +89,6 @@ class Count:
 
     value: int
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "count", "value": self.value}
-
     def check(self, before: "Count | None", finished: bool) -> None:
         if before is not None and not before.value <= self.value <= before.value + finished:
             raise MalformedReply(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
@@ -104,9 +100,6 @@ class Identity:
 
     words: str
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "identity", "words": self.words}
-
     def check(self, before: "Identity | None", finished: bool) -> None:
         """See `Notebook.written`: things are moved, so that other words may tell them."""
 
@@ -117,9 +110,6 @@ class Route:
 
     steps: tuple[str, ...]
     done: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "route", "steps": list(self.steps), "done": self.done}
 
     def check(self, before: "Route | None", finished: bool) -> None:
         if self.done > len(self.steps):
@@ -234,7 +224,7 @@ class NotebookEpisode(SubgoalEpisode):
 
 
 @SUBGOALS.register("notebook")
-class NotebookPredictor(SubgoalPredictor):
+class NotebookPredictor(PromptedPredictor):
     """Asks whether the subgoal is complete; only then brings the notebook up to date and names the next one.
 
     The notebook is what a question tells of the past, beside the frames of the current subgoal: no conversation grows.
@@ -242,11 +232,9 @@ class NotebookPredictor(SubgoalPredictor):
 
     Args:
         interval: steps between two questions to the monitor.
-        workers: questions under way at once.
-        api: how the model is spoken to (`mme_vla.subgoal.models.api.CONNECTIONS`).
-        client: what the questions go to; None makes one.
-        settings: keys of the api's settings.
     """
+
+    episode_type = NotebookEpisode
 
     def __init__(
         self,
@@ -257,17 +245,7 @@ class NotebookPredictor(SubgoalPredictor):
         client: Any = None,
         **settings: Any,
     ) -> None:
-        super().__init__(kind, interval)
-        raise_if(workers < 1, f"workers={workers} must be at least 1: questions under way at once.")
-        self.workers = workers
-        self.api = make_api(api, settings, "subgoal", self.usage, client)
-        self._lock = threading.Lock()
-
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> NotebookEpisode:
-        return NotebookEpisode(goal, video, task)
-
-    def predict_due(self, episodes: Sequence[NotebookEpisode]) -> list[Subgoal]:
-        return side_by_side(self._ask, episodes, self.workers)
+        super().__init__(kind, interval, workers, api, client, settings)
 
     def _ask(self, episode: NotebookEpisode) -> Subgoal:
         replies: list[str] = []

@@ -68,13 +68,11 @@ class QwenVL(VLMPredictor):
     """
 
     sees_passing = False
+    episode_type = QwenEpisode
 
     def __init__(self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any) -> None:
         super().__init__(kind, interval, **options)
         self.hold = hold
-
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> QwenEpisode:
-        return QwenEpisode(goal, video, task)
 
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held is left out."""

@@ -1,7 +1,7 @@
 """From a language model's answer to a subgoal: points, JSON, coordinates.
 
 Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000; the policy reads pixels of
-the 256×256 front image, `<row, column>`. What cannot be read raises `MalformedAnswer`, which the predictors count
+the 256×256 front image, `<row, column>`. What cannot be read raises `MalformedReply`, which the predictors count
 and survive.
 """
 

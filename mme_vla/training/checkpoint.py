@@ -237,7 +237,8 @@ def _places(folder: Path, step: int) -> tuple[Path, Path]:
 
 
 def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any) -> None:
-    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": _versions(), **more}
+    versions = {name: importlib.metadata.version(name) for name in ("mme-vla", "torch", "numpy")}
+    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": versions, **more}
     (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
 
 
@@ -271,10 +272,6 @@ def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str,
         f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
         "It belongs to another model or other settings.",
     )
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in ("mme-vla", "torch", "numpy")}
 
 
 def _flush(folder: Path) -> None:

@@ -258,17 +258,14 @@ class Loggers:
 def check_logger(config: Mapping[str, Any]) -> None:
     """Raise an error, before any long work, if the package of the logger that the section `logger` names is missing."""
     name = (config.get("logger") or {}).get("name")
-    if name in ("wandb", "trackio", "mlflow") and not _is_installed(name):
+    try:
+        is_installed = name not in ("wandb", "trackio", "mlflow") or find_spec(name) is not None
+    except ValueError:  # a module without a specification
+        is_installed = False
+    if not is_installed:
         if name == "wandb":
             raise missing_extra("logger=wandb", "wandb")
         raise UserError(f"logger={name} needs the package {name}: pip install -c constraints.txt {name}")
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        return find_spec(package) is not None
-    except ValueError:  # a module without a specification
-        return False
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:

@@ -60,7 +60,7 @@ def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str
             run = open_run(place, resume, config)
             lock = FolderLock(run.folder, "training run").acquire()
         except UserError:
-            if named or resume is not None or not _in_use(place):
+            if named or resume is not None or not (_holds_run(place) or (place / LOCK).exists()):
                 raise
             continue
         try:
@@ -146,21 +146,18 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration with what runs of earlier versions did not say, because there was no other choice."""
     train = {f.name: f.default for f in fields(TrainSettings) if f.default is not MISSING and f.name != "seed"}
+    data = dict(config.get("data") or {})
+    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:  # now the default
+        data["val_episodes"] = None
     return {
         **config,
         "embodiment": embodiment_of(config).to_dict(),
         "train": {**train, **config["train"]},
-        "data": _with_default_split(config.get("data") or {}),
+        "data": data,
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
         **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
     }
-
-
-def _with_default_split(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The section `data` as it is written now: runs on the shipped sample named the episode that is now the default."""
-    is_default = list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]
-    return {**data, "val_episodes": None} if is_default else dict(data)
 
 
 def _with_head(section: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,11 +177,6 @@ def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str
 
 def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
-
-
-def _in_use(folder: Path) -> bool:
-    """Whether a folder holds a run, or one that has not written anything yet."""
-    return _holds_run(folder) or (folder / LOCK).exists()
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

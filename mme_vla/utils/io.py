@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from mme_vla.errors import UserError, brief, listed, raise_if
 
@@ -226,7 +226,7 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
     """
     try:
         # Python's own constants are looked at only where they are refused: hooks slow the parser down.
-        value = json.loads(text, parse_float=_finite, parse_constant=_no_constant) if finite else json.loads(text)
+        value = json.loads(text, parse_float=_finite, parse_constant=_finite) if finite else json.loads(text)
     except RecursionError:
         raise UserError(f"{source} is nested too deeply to be JSON of this library.") from None
     except (ValueError, OverflowError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
@@ -369,14 +369,11 @@ def to_json(value: Any) -> Any:
 
 
 def _finite(text: str) -> float:
-    value = float(text)
-    if math.isinf(value):
+    if text in ("NaN", "Infinity", "-Infinity"):  # Python's own constants
+        raise ValueError(f"{text} is not a number")
+    if math.isinf(value := float(text)):
         raise ValueError(f"the number {brief(text)} is out of range")
     return value
-
-
-def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a number")
 
 
 _DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")

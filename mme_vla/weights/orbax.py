@@ -82,7 +82,11 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
     if isinstance(params, Zipped):
         params.check()
     else:
-        _check_files(params)
+        for place in params.rglob("*"):
+            if place.is_symlink():
+                inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
+            if not place.is_dir():  # tensorstore would wait for a pipe without end
+                require_file(place, "a part of an Orbax checkpoint")
     ocdbt = (params / MANIFEST).is_file() if isinstance(params, Path) else MANIFEST in params.names
     try:
         arrays = _list_arrays(ts, params, ocdbt)
@@ -108,14 +112,6 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
         raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
     raise_if(not tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
-
-
-def _check_files(params: Path) -> None:
-    for place in params.rglob("*"):
-        if place.is_symlink():
-            inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
-        if not place.is_dir():  # tensorstore would wait for a pipe without end
-            require_file(place, "a part of an Orbax checkpoint")
 
 
 def _check_chunks(stores: Mapping[str, Any], params: Path | Zipped) -> None:

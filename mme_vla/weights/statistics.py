@@ -32,16 +32,13 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     folder = Path(folder)
     files = stats_files(folder)
     if asset is not None or len(files) > 1:
-        raise_if(
-            asset not in files,
-            f"{folder} holds statistics of {listed(files) or 'no dataset'}: "
-            + (f"there are none of {brief(asset)}." if asset else "say which: --asset, or read_stats(folder, asset)."),
-        )
+        if asset not in files:
+            reason = f"none of {brief(asset)}." if asset else "say which: --asset, or read_stats(folder, asset)."
+            raise UserError(f"{folder} holds statistics of {listed(files) or 'no dataset'}: {reason}")
         return NormStats.load(_local_file(folder, files[asset]))
+    files |= {"": folder / "norm_stats.json"} if (folder / "norm_stats.json").is_file() else {}
     if files:
         return NormStats.load(_local_file(folder, next(iter(files.values()))))
-    if (folder / "norm_stats.json").is_file():
-        return NormStats.load(_local_file(folder, folder / "norm_stats.json"))
     for fmt in METHOD_FORMATS.values():
         if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
             return stats

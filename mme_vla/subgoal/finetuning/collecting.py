@@ -9,11 +9,11 @@ with the episodes that are missing, and the same input always gives the same fil
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -38,9 +38,6 @@ from mme_vla.utils import (
     write_sums,
 )  # fmt: skip
 from mme_vla.utils.media import png_bytes, write_video
-
-if TYPE_CHECKING:
-    pass
 
 PARTS = "parts"
 
@@ -124,31 +121,19 @@ def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], op
         for image, frame in built.images.items():
             paths_at.setdefault(frame, []).append(output / image)
         if built.video:
-            _write_once(output / built.video, partial(_write_video, episode, labels.exec_start))
+            path = output / built.video
+            if not path.is_file():
+                write_video(episode.read_images(range(labels.exec_start)), path, **ENCODING)
     missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(paths_at.items())}
     steps = [t for t, paths in missing.items() if paths]
     for t, pixels in zip(steps, episode.read_images(steps), strict=True):
         for path in missing[t]:
-            _write_once(path, partial(_write_png, pixels))
+            with write_atomically(path) as draft:
+                draft.write_bytes(png_bytes(pixels))
     for name in sets:  # the rows last: where they are, their images are
         rows = episode_rows(name, labels, options).rows
         with write_atomically(_part(output, name, episode)) as draft:
             draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
-
-
-def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path)
-
-
-def _write_video(episode: Demonstration, length: int, path: Path) -> None:
-    write_video(episode.read_images(range(length)), path, **ENCODING)
-
-
-def _write_png(image: np.ndarray, path: Path) -> None:
-    with write_atomically(path) as draft:
-        draft.write_bytes(png_bytes(image))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:
@@ -158,16 +143,8 @@ def _part(output: Path, name: str, episode: Demonstration) -> Path:
 def _h5_readers(ref: EpisodeRef) -> tuple[Callable[[], Labels], Callable[[Sequence[int]], Iterator[np.ndarray]]]:
     def labels() -> Labels:
         with open_episode(ref) as episode:
-            texts = list(episode.subgoals())
-            return Labels(
-                ref.task,
-                ref.index,
-                episode.goals[0],
-                episode.exec_start,
-                [text["simple_subgoal"] for text in texts],
-                [text["grounded_subgoal"] for text in texts],
-                *episode.joints(),
-            )
+            texts = _two_kinds(list(episode.subgoals()))
+            return Labels(ref.task, ref.index, episode.goals[0], episode.exec_start, *texts, *episode.joints())
 
     def read_images(steps: Sequence[int]) -> Iterator[np.ndarray]:
         with open_episode(ref) as episode:
@@ -209,18 +186,15 @@ def _read_tasks(path: Path) -> dict[str, str]:
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
     texts = [source.subgoals(episode, t) for t in range(int(source.lengths[episode]))]
-    return Labels(
-        task,
-        number,
-        source.goal(episode),
-        int(source.exec_starts[episode]),
-        [text["simple_subgoal"] for text in texts],
-        [text["grounded_subgoal"] for text in texts],
-        source.states(episode)[:, :ARM_JOINTS],
-        source.actions(episode)[:, :ARM_JOINTS],
-    )
+    joints, targets = source.states(episode)[:, :ARM_JOINTS], source.actions(episode)[:, :ARM_JOINTS]
+    start = int(source.exec_starts[episode])
+    return Labels(task, number, source.goal(episode), start, *_two_kinds(texts), joints, targets)
 
 
 def _lerobot_images(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
     for start in range(0, len(steps), 64):  # what is decoded at once stays small
         yield from source.frames(episode, list(steps[start : start + 64]))
+
+
+def _two_kinds(texts: Sequence[Mapping[str, str]]) -> tuple[list[str], list[str]]:
+    return [text["simple_subgoal"] for text in texts], [text["grounded_subgoal"] for text in texts]

@@ -107,7 +107,8 @@ def keyframes(labels: Labels, substring_match: bool = False) -> list[int]:
     starts = changes(labels)
     frames = [t for t in starts if t != labels.last]
     bounds = sorted({*starts, labels.last})
-    for segment, count in enumerate(_midpoints(labels.task, substring_match)):
+    task = "ButtonUnmaskSwap" if substring_match and labels.task in "ButtonUnmaskSwap" else labels.task
+    for segment, count in enumerate(_MIDPOINTS.get(task, ())):
         if segment + 1 < len(bounds):
             frames += np.linspace(bounds[segment], bounds[segment + 1], count + 2)[1:-1].astype(int).tolist()
     if labels.task in _STILL:
@@ -157,12 +158,6 @@ def windows(labels: Labels, targets: Sequence[int], one_a_window: bool = False) 
             rows.append(Window(list(past), frames, [frames.index(f) + 1 for f in matches]))
             past, frames, matches = past + matches, [], []
     return rows
-
-
-def _midpoints(task: str, substring_match: bool) -> Sequence[int]:
-    if substring_match and task in "ButtonUnmaskSwap":
-        task = "ButtonUnmaskSwap"
-    return _MIDPOINTS.get(task, ())
 
 
 def _merged(frames: Sequence[int]) -> list[int]:

@@ -171,15 +171,14 @@ def _fault(row: Row) -> str:
             return f"{key} is {brief(names)}, not a list of files"
     objects = row.get("objects", {})
     points = objects.get("bbox", []) if isinstance(objects, dict) else None
-    if not isinstance(points, list) or not all(_is_point(point) for point in points):
+    if not isinstance(points, list) or not all(
+        isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
+        for point in points
+    ):
         return f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
     if (marks := texts[1].count(BBOX) + texts[2].count(BBOX)) != len(points):
         return f"it has {marks} marks {BBOX} for {len(points)} points"
     return ""
-
-
-def _is_point(point: object) -> bool:
-    return isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
 
 
 def texts_of(row: Row) -> tuple[str, str, str]:
@@ -211,7 +210,8 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         example = next((name for row in rows for name in row.get("images", [])), None)
         if example is None:
             raise UserError(f"{file} has no row with an image. Build the training data again.")
-        image = _image_tokens(read_image(inside(self.folder, example, "picture")).shape)
+        height, width, _ = read_image(inside(self.folder, example, "picture")).shape
+        image = min(max(round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE), 4), IMAGE_TOKENS)
         self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
         self.left_out = len(rows) - len(self.rows)
         raise_if(not self.rows, f"All rows of {file} are longer than max_length={max_length}; raise it.")
@@ -275,10 +275,6 @@ def hf_dataset(file: str | Path) -> Any:
         videos=List(Value("string")),
     )
     return Dataset.from_dict(columns, features=features)
-
-
-def _image_tokens(shape: Sequence[int]) -> int:
-    return min(max(round(shape[0] / TOKEN_SIDE) * round(shape[1] / TOKEN_SIDE), 4), IMAGE_TOKENS)
 
 
 def _longest(row: Row, tokenizer: Any, image: int) -> int:

@@ -123,13 +123,6 @@ class Api:
                 self._connection = CONNECTIONS[self.provider](self.settings, self.client)
             return self._connection
 
-    def _needed(self) -> Connection:
-        try:
-            return self._connected()
-        except UserError as error:
-            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
-            raise UserError(f"{error}{hint}") from None
-
     def ask(self, system: str, messages: Sequence[Message]) -> Reply:
         """Ask the last turn of a conversation.
 
@@ -155,7 +148,11 @@ class Api:
         return reply
 
     def _tried(self, system: str, messages: Sequence[Message]) -> Reply:
-        connection = self._needed()
+        try:
+            connection = self._connected()
+        except UserError as error:
+            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
+            raise UserError(f"{error}{hint}") from None
         pause = self.settings.backoff
         failure = ApiFailure("failed", "never asked")
         for attempt in range(self.settings.retries + 1):
@@ -173,7 +170,7 @@ class Api:
                     break
             except Exception as error:  # whatever the network and the client come up with
                 reason = self._redacted(f"{type(error).__name__}: {error}")
-                if self._is_fatal(error):
+                if _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower()):
                     raise UserError(
                         f"{self.settings.model} cannot be asked: {reason}. Check the key in "
                         f"${self.settings.key_variable} and the model's name."
@@ -229,9 +226,6 @@ class Api:
             if len(secret) >= shortest:
                 text = text.replace(secret, "***")
         return text
-
-    def _is_fatal(self, error: Exception) -> bool:
-        return _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower())
 
 
 def _read_reply(path: Path) -> Reply | None:

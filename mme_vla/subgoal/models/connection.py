@@ -137,13 +137,13 @@ def _google_client(settings: Settings) -> Any:
 def _part(part: Any) -> Mapping[str, Any]:
     if isinstance(part, str):
         return {"text": part}
-    return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", _inline)
 
+    def inline(pixels: np.ndarray) -> Mapping[str, Any]:
+        is_image = pixels.ndim == 3
+        data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
+        return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
 
-def _inline(pixels: np.ndarray) -> Mapping[str, Any]:
-    is_image = pixels.ndim == 3
-    data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
-    return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
+    return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", inline)
 
 
 def _refusal(response: Any) -> str:
