@@ -278,6 +278,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
 
 
 def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> None:
+    import av
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -323,19 +324,10 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
     dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     for path in root.glob("videos/**/*.mp4"):
-        if (count := count_frames(path)) != episode.length:
+        with av.open(str(path)) as container:
+            count = sum(packet.size > 0 for packet in container.demux(video=0))  # without decoding
+        if count != episode.length:
             raise RuntimeError(f"{path} holds {count} frames instead of {episode.length}.")
-
-
-def count_frames(path: Path) -> int:
-    """Number of images in a video file, counted without decoding."""
-    import av
-
-    container = av.open(str(path))
-    try:
-        return sum(packet.size > 0 for packet in container.demux(video=0))
-    finally:
-        container.close()
 
 
 def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:

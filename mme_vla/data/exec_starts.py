@@ -14,7 +14,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import UserError, listed, raise_if
+from mme_vla.errors import listed, raise_if
 
 NEAR = 0.05  # radians on average: a demonstration that was made anew differs a little, another episode by far more
 _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
@@ -51,20 +51,20 @@ def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
 def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> list[int]:
     """The first execution frame of every episode of a dataset that does not mark its videos."""
     source = EpisodeSource(dataset, robot=_UNMARKED)
-    return [_start_of(source, episode, annotated) for episode in range(len(source))]
-
-
-def _start_of(source: EpisodeSource, episode: int, annotated: Sequence[AnnotatedEpisode]) -> int:
-    goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
-    alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
-    apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
-    nearest = min(apart, default=np.inf)
-    starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
-    if nearest > NEAR:
+    matches = []
+    for episode in range(len(source)):
+        goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
+        alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
+        apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
+        nearest = min(apart, default=np.inf)
+        starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
         near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
-        raise UserError(
-            f"{source.root}, episode {episode} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} "
-            f"episodes given: {near}. Give the recordings that the dataset was made from, all of them."
+        place = f"{source.root}, episode {episode}"
+        raise_if(
+            nearest > NEAR,
+            f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes given: {near}. Give "
+            "the recordings that the dataset was made from, all of them.",
         )
-    raise_if(len(starts) > 1, f"{source.root}, episode {episode}: recordings that fit alike begin at {listed(starts)}.")
-    return starts[0]
+        raise_if(len(starts) > 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
+        matches.append(starts[0])
+    return matches

@@ -31,7 +31,15 @@ def split_episodes(
     bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
     change when data are added, and needs no random numbers.
     """
-    named = _by_source(val_episodes or [], sources)
+    named: dict[str, list[int]] = {}
+    for name in val_episodes or ():
+        source_name, _, number = str(name).rpartition("/")
+        if not number.isdigit() or (not source_name and len(sources) > 1):
+            reason = ", since there are several sources." if number.isdigit() else "."
+            raise UserError(
+                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0{reason}"
+            )
+        named.setdefault(source_name or sources[0].name, []).append(int(number))
     unknown = set(named) - {source.name for source in sources}
     raise_if(
         unknown,
@@ -63,20 +71,6 @@ def split_episodes(
 def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
     """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any other dataset."""
     return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
-
-
-def _by_source(names: Sequence[int | str], sources: Sequence[EpisodeSource]) -> dict[str, list[int]]:
-    """Group `<source>/<number>` words, or bare numbers of the only source."""
-    grouped: dict[str, list[int]] = {}
-    for name in names:
-        source, _, number = str(name).rpartition("/")
-        if not number.isdigit() or (not source and len(sources) > 1):
-            raise UserError(
-                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0"
-                + (", since there are several sources." if number.isdigit() else ".")
-            )
-        grouped.setdefault(source or sources[0].name, []).append(int(number))
-    return grouped
 
 
 _KEYS = ("root", "name", "exec_starts")

@@ -243,7 +243,12 @@ def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any)
 
 
 def _publish(draft: Path, target: Path) -> Path:
-    _flush(draft)
+    for path in (*draft.rglob("*"), draft):  # the disk holds all of it before the folder gets its final name
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
     replace_folder(draft, target)
     return target
 
@@ -272,13 +277,3 @@ def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str,
         f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
         "It belongs to another model or other settings.",
     )
-
-
-def _flush(folder: Path) -> None:
-    """Have the disk hold what was written before the folder gets its final name."""
-    for path in (*folder.rglob("*"), folder):
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -136,7 +136,14 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)
     rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
-    sums = {file: _sums_of(checkpoint, file) for file in files}
+    sums: dict[Path, Sums] = {}
+    for file in files:
+        note = file.with_suffix(".sha256")
+        for path in (file, note):
+            inside(checkpoint, path.relative_to(checkpoint).as_posix())
+        sums[file] = Sums(file.parent, note.name)
+        raise_if(file.name not in sums[file].table, f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
+        check_header(file)
     for file in files[rank::world]:  # all together compare each file once
         sums[file].check(file.name)
     reader = dcp.HuggingFaceStorageReader(str(folder))
@@ -158,16 +165,6 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
             raise next(iter(error.failures.values()))[0] from error
     local = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
     check_values(local, str(folder))
-
-
-def _sums_of(checkpoint: Path, file: Path) -> Sums:
-    note = file.with_suffix(".sha256")
-    for path in (file, note):
-        inside(checkpoint, path.relative_to(checkpoint).as_posix())
-    sums = Sums(file.parent, note.name)
-    raise_if(file.name not in sums.table, f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
-    check_header(file)
-    return sums
 
 
 def _decoding(folder: Path) -> AbstractContextManager[None]:

@@ -100,7 +100,13 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
         }  # fmt: skip
         # All are asked for before the first is waited for, so that reading overlaps.
         stores = {name: opened.result() for name, opened in pending.items()}
-        _check_chunks(stores, params)
+        for name, store in stores.items():  # a few bytes on disk would fill the memory
+            piece = math.prod(store.chunk_layout.read_chunk.shape or ())
+            raise_if(
+                piece > max(2 * math.prod(store.shape), _SMALL_PIECE),
+                f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
+                f"lie in pieces of {piece:,} numbers.",
+            )
         if fits is not None:
             fits({name: torch.empty(store.shape, device="meta") for name, store in stores.items()})
         reads = {name: store.read() for name, store in stores.items()}
@@ -112,17 +118,6 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
         raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
     raise_if(not tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
-
-
-def _check_chunks(stores: Mapping[str, Any], params: Path | Zipped) -> None:
-    """Refuse arrays whose pieces are larger than they are: a few bytes on disk would fill the memory."""
-    for name, store in stores.items():
-        piece = math.prod(store.chunk_layout.read_chunk.shape or ())
-        raise_if(
-            piece > max(2 * math.prod(store.shape), _SMALL_PIECE),
-            f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
-            f"lie in pieces of {piece:,} numbers.",
-        )
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
@@ -263,11 +258,7 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
             raise UserError(f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no checkpoint.")
     if total > _SMALL and total > _MOST_RATIO * packed:
         raise UserError(f"{file}: {packed:,} bytes unpack to {total:,}: that is no checkpoint.")
-    _check_distinct(file, entries, end)
-
-
-def _check_distinct(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
-    """Refuse names and bytes that stand twice: what is compared with its checksum might not be what is read."""
+    # Names and bytes that stand twice: what is compared with its checksum might not be what is read.
     names: set[str] = set()
     for entry in entries:
         raise_if(entry.filename in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}")

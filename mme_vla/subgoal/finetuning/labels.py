@@ -40,7 +40,9 @@ class Labels:
 
     def __post_init__(self) -> None:
         for texts in (self.simple, self.grounded):
-            texts[:] = without_complete(texts)
+            for t, text in enumerate(texts):  # "complete" is no subgoal: the one before it stays
+                if t and text.strip().lower() == "complete":
+                    texts[t] = texts[t - 1]
 
     @property
     def length(self) -> int:
@@ -54,14 +56,6 @@ class Labels:
     def texts(self, kind: str) -> list[str]:
         """The subgoals of a kind, `simple` or `grounded`."""
         return {"simple": self.simple, "grounded": self.grounded}[kind]
-
-
-def without_complete(texts: Sequence[str]) -> list[str]:
-    """Replace "complete", which is no subgoal, by the one before it."""
-    result: list[str] = []
-    for text in texts:
-        result.append(result[-1] if result and text.strip().lower() == "complete" else text)
-    return result
 
 
 def changes(labels: Labels) -> list[int]:
@@ -112,7 +106,13 @@ def keyframes(labels: Labels, substring_match: bool = False) -> list[int]:
         if segment + 1 < len(bounds):
             frames += np.linspace(bounds[segment], bounds[segment + 1], count + 2)[1:-1].astype(int).tolist()
     if labels.task in _STILL:
-        return _merged([*frames, *resting_frames(labels)])
+        merged: list[int] = []
+        for frame in sorted([*frames, *resting_frames(labels)]):  # the running midpoint of those closer than 10
+            if merged and frame - merged[-1] < _MERGE:
+                merged[-1] = (merged[-1] + frame) // 2
+            else:
+                merged.append(frame)
+        return merged
     return sorted(set(frames))
 
 
@@ -158,14 +158,3 @@ def windows(labels: Labels, targets: Sequence[int], one_a_window: bool = False) 
             rows.append(Window(list(past), frames, [frames.index(f) + 1 for f in matches]))
             past, frames, matches = past + matches, [], []
     return rows
-
-
-def _merged(frames: Sequence[int]) -> list[int]:
-    """Join frames closer than 10 into one, the running midpoint."""
-    merged: list[int] = []
-    for frame in sorted(frames):
-        if merged and frame - merged[-1] < _MERGE:
-            merged[-1] = (merged[-1] + frame) // 2
-        else:
-            merged.append(frame)
-    return merged
