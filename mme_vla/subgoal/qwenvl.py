@@ -100,5 +100,5 @@ class QwenVL(VLMPredictor):
         except MalformedReply as error:
             problem, reason = problem_of(reply, error)
             return self.unchanged(episode, problem, reply, reason)
-        episode.history.add_parsed(parsed)
+        episode.history.add(parsed.entry, parsed.points)
         return self.accepted(parsed, reply)

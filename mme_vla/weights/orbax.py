@@ -213,25 +213,14 @@ _REMEDY = "Download or copy it again."
 _facts: dict[tuple[Path, int], tempfile.TemporaryDirectory[str]] = {}
 
 
-@dataclass(frozen=True)
-class Archive:
-    """An archive that holds a checkpoint.
-
-    params: where its arrays are. folder: what says its variant, and its statistics, unpacked until the program ends.
-    """
-
-    params: Zipped
-    folder: Path
-
-
 def find_archive(folder: Path) -> Path | None:
     """The archive of the newest step in a folder, such as `79999.zip`; None without any."""
     steps = [file for file in folder.glob(f"*{ARCHIVE_SUFFIX}") if file.stem.isdigit()]
     return max(steps, key=lambda file: int(file.stem)) if steps else None
 
 
-def open_archive(file: Path) -> Archive:
-    """Look through an archive and find the checkpoint in it."""
+def open_archive(file: Path) -> tuple[Zipped, Path]:
+    """Find the checkpoint in an archive: its arrays, and a folder of its variant's name and statistics, unpacked."""
     with decoding(file, "a zip archive", _REMEDY), zipfile.ZipFile(file) as opened:
         entries = [entry for entry in opened.infolist() if not entry.is_dir()]
         _check(file, entries, opened.start_dir)
@@ -241,7 +230,7 @@ def open_archive(file: Path) -> Archive:
             raise UserError(f"{file} holds no checkpoint of the released code: there are no Orbax arrays in it.")
         within = tuple(name.removeprefix(place) for name in names if name.startswith(place))
         folder = _unpack_facts(file, opened, entries)
-    return Archive(Zipped(file.resolve(), place, within), folder)
+    return Zipped(file.resolve(), place, within), folder
 
 
 def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:

@@ -221,8 +221,8 @@ def open_source(
 
 
 def _of_archive(file: Path) -> Source:
-    archive = open_archive(file)
-    return Source("released", archive.folder, params=archive.params)
+    params, folder = open_archive(file)
+    return Source("released", folder, params=params)
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:

@@ -77,12 +77,10 @@ def prefixed(prefix: str, table: NameTable) -> NameTable:
     return {f"{prefix}.{name}": pieces for name, pieces in table.items()}
 
 
-def linear(path: str, *, layer: int | None = None, bias: bool = True) -> NameTable:
+def linear(path: str, *, layer: int | None = None) -> NameTable:
     """A linear layer stored as kernel (in, out), with its bias."""
-    table: NameTable = {"weight": [Piece(f"{path}/kernel", "i o -> o i", layer=layer)]}
-    if bias:
-        table["bias"] = [Piece(f"{path}/bias", layer=layer)]
-    return table
+    kernel, bias = Piece(f"{path}/kernel", "i o -> o i", layer=layer), Piece(f"{path}/bias", layer=layer)
+    return {"weight": [kernel], "bias": [bias]}
 
 
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -98,18 +96,6 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
             raise UserError(f"{name} cannot be made of {shapes}: {error}") from error
         target[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
     return target
-
-
-def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
-    """Make sure that the constants a checkpoint stores are the ones this configuration gives."""
-    for constant in derived:
-        if constant.path in source:
-            stored, expected = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
-            raise_if(
-                stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
-                f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
-                f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here.",
-            )
 
 
 def write(
@@ -180,7 +166,14 @@ class Adapter:
     def translate(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
         """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
-        check(self.derived, released)
+        for constant in self.derived:  # what a checkpoint stores of them is what this configuration gives
+            if constant.path in released:
+                stored, expected = (x.real.float().cpu() for x in (released[constant.path], constant.make()))
+                raise_if(
+                    stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
+                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
+                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here.",
+                )
         derived = {constant.path for constant in self.derived}
         return read(self.table, {name: tensor for name, tensor in released.items() if name not in derived})
 
