@@ -8,13 +8,13 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what to do."""
 
 
-def raise_if(condition: object, message: str) -> None:
-    """Raise a `UserError` with this message where the condition holds.
+def raise_if(condition: object, message: str, error: type[Exception] = UserError) -> None:
+    """Raise an error with this message where the condition holds.
 
     The message is made in either case: for checks in a hot loop, or of a value it cannot name, write `if` and `raise`.
     """
     if condition:
-        raise UserError(message)
+        raise error(message)
 
 
 def did_you_mean(name: str, options: Iterable[str]) -> str:

@@ -281,8 +281,7 @@ def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
 def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
-    if not isinstance(frames, list):
-        raise UserError(f"{key} must be a list of uint8 images [height, width, 3].")
+    raise_if(not isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
     if not 1 <= len(frames) <= most:
         raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
     shapes = {_image(key, frame).shape for frame in frames}

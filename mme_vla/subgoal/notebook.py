@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import brief
+from mme_vla.errors import brief, raise_if
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
@@ -112,10 +112,8 @@ class Route:
     done: int = 0
 
     def check(self, before: "Route | None", finished: bool) -> None:
-        if self.done > len(self.steps):
-            raise MalformedReply(f"{self.done} of {len(self.steps)} steps cannot be done")
-        if before is not None and before.steps != self.steps:
-            raise MalformedReply("the steps of a route were changed")
+        raise_if(self.done > len(self.steps), f"{self.done} of {len(self.steps)} steps cannot be done", MalformedReply)
+        raise_if(before is not None and before.steps != self.steps, "the steps of a route were changed", MalformedReply)
         if before is not None and not before.done <= self.done <= before.done + finished:
             raise MalformedReply(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
 
@@ -143,8 +141,7 @@ class Notebook:
                 raise MalformedReply(f"{brief(name)} was another kind of note before")
             note.check(before, finished is not None)  # type: ignore[arg-type]
             notes[name] = note
-        if len(notes) > MOST_NOTES:
-            raise MalformedReply(f"the notebook takes {MOST_NOTES} notes")
+        raise_if(len(notes) > MOST_NOTES, f"the notebook takes {MOST_NOTES} notes", MalformedReply)
         return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
 
     def in_words(self) -> str:
@@ -176,9 +173,12 @@ def _read(entry: dict[str, Any]) -> Note:
     if kind == "identity":
         return Identity(_words(entry.get("words"), "words"))
     if kind == "route":
-        steps = entry.get("steps")
-        if not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS:
-            raise MalformedReply(f"steps is not a list of 1 to {MOST_STEPS} texts")
+        steps: Any = entry.get("steps")
+        raise_if(
+            not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS,
+            f"steps is not a list of 1 to {MOST_STEPS} texts",
+            MalformedReply,
+        )
         return Route(tuple(_words(step, "steps") for step in steps), _integer(entry.get("done", 0), "done", MOST_STEPS))
     raise MalformedReply(f"there are notes of the kinds count, identity and route, not {brief(kind)}")
 
@@ -186,8 +186,7 @@ def _read(entry: dict[str, Any]) -> Note:
 def _words(value: Any, what: str) -> str:
     if not isinstance(value, str) or not is_text(value) or not (text := " ".join(value.split())):
         raise MalformedReply(f"the {what} of a note is no text")
-    if len(text) > MOST_WORDS:
-        raise MalformedReply(f"the {what} of a note has more than {MOST_WORDS} characters")
+    raise_if(len(text) > MOST_WORDS, f"the {what} of a note has more than {MOST_WORDS} characters", MalformedReply)
     return text
 
 
@@ -267,8 +266,7 @@ class NotebookPredictor(PromptedPredictor):
             query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
             replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
             done = json_object(replies[-1]).get("done")
-            if not isinstance(done, bool):
-                raise MalformedReply("the monitor's answer does not say whether it is done")
+            raise_if(not isinstance(done, bool), "the monitor's answer does not say whether it is done", MalformedReply)
             episode.agreed = done
         return episode.agreed
 

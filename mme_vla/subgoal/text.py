@@ -8,9 +8,10 @@ and survive.
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, raise_if
 from mme_vla.utils import is_text, parse_json
 
 IMAGE, VIDEO, BBOX = "<image>", "<video>", "<bbox>"
@@ -152,13 +153,14 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
 def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
     """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points."""
     text = " ".join(reply.split())
-    if not text:
-        raise MalformedReply("the answer is empty")
+    raise_if(not text, "the answer is empty", MalformedReply)
     pixels = [(int(y), int(x)) for y, x in _BOX.findall(text)]
-    if any(value > THOUSAND for point in pixels for value in point):
-        raise MalformedReply("a point lies outside 0…1000")
-    if _BOX_MARK.search(_BOX.sub("", text)):
-        raise MalformedReply("a point is not of the form <|box_start|>(a,b)<|box_end|>")
+    raise_if(
+        any(value > THOUSAND for point in pixels for value in point), "a point lies outside 0…1000", MalformedReply
+    )
+    raise_if(
+        _BOX_MARK.search(_BOX.sub("", text)), "a point is not of the form <|box_start|>(a,b)<|box_end|>", MalformedReply
+    )
     points = tuple((to_pixels(y, side), to_pixels(x, side)) for y, x in pixels)
     values = iter(points)
     display_text = _BOX.sub(lambda _: "<{}, {}>".format(*next(values)), text)
@@ -177,10 +179,12 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
     """
     fields = json_object(reply)
     subtask, positions = fields.get("current_subtask"), fields.get("keyframe_positions", [])
-    if not isinstance(subtask, str):
-        raise MalformedReply("the answer has no current_subtask")
-    if not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions):
-        raise MalformedReply("keyframe_positions is not a list of whole numbers")
+    raise_if(not isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
+    raise_if(
+        not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
+        "keyframe_positions is not a list of whole numbers",
+        MalformedReply,
+    )
     return parse_subgoal(_writable(subtask), side), sorted({p for p in positions if 1 <= p <= recent})
 
 
@@ -194,8 +198,7 @@ def parse_gemini(reply: str) -> str:
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
     text = json_object(reply).get("subgoal")
-    if not isinstance(text, str) or not text.strip():
-        raise MalformedReply("the answer names no subgoal")
+    raise_if(not isinstance(text, str) or not text.strip(), "the answer names no subgoal", MalformedReply)
     return _writable(text.strip())
 
 
@@ -229,13 +232,12 @@ def points_of(text: str) -> tuple[Point, ...]:
     return tuple((int(y), int(x)) for y, x in _PIXELS.findall(text))
 
 
-def json_object(reply: str) -> dict[str, object]:
+def json_object(reply: str) -> dict[str, Any]:
     """The outermost braces of an answer as JSON."""
     start, stop = reply.find("{"), reply.rfind("}")
-    if start < 0 or stop < start:
-        raise MalformedReply("the answer holds no JSON object")
+    raise_if(start < 0 or stop < start, "the answer holds no JSON object", MalformedReply)
     try:
-        fields: dict[str, object] = parse_json(reply[start : stop + 1], "the answer", finite=False)
+        fields: dict[str, Any] = parse_json(reply[start : stop + 1], "the answer", finite=False)
     except UserError as error:
         raise MalformedReply(f"the answer is not JSON: {error}") from None
     return fields
@@ -243,6 +245,5 @@ def json_object(reply: str) -> dict[str, object]:
 
 def _writable(text: str) -> str:
     """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
-    if not is_text(text):
-        raise MalformedReply("the answer holds half a character")
+    raise_if(not is_text(text), "the answer holds half a character", MalformedReply)
     return text
