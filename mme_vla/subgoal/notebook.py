@@ -265,7 +265,7 @@ class NotebookPredictor(PromptedPredictor):
             images = episode.images()
             query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
             replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
-            done = json_object(replies[-1]).get("done")
+            done: Any = json_object(replies[-1]).get("done")
             raise_if(not isinstance(done, bool), "the monitor's answer does not say whether it is done", MalformedReply)
             episode.agreed = done
         return episode.agreed

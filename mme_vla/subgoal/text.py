@@ -178,7 +178,8 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
         The subgoal and the positions, from 1, in ascending order.
     """
     fields = json_object(reply)
-    subtask, positions = fields.get("current_subtask"), fields.get("keyframe_positions", [])
+    subtask: Any = fields.get("current_subtask")
+    positions: Any = fields.get("keyframe_positions", [])
     raise_if(not isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
     raise_if(
         not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
@@ -197,7 +198,7 @@ def parse_gemini(reply: str) -> str:
         quoted = _QUOTED.search(remainder)
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
-    text = json_object(reply).get("subgoal")
+    text: Any = json_object(reply).get("subgoal")
     raise_if(not isinstance(text, str) or not text.strip(), "the answer names no subgoal", MalformedReply)
     return _writable(text.strip())
 

@@ -51,6 +51,9 @@ def test_png_conversion_is_exact(tmp_path: Path, recorded) -> None:
     refs, episodes = recorded
     assert convert(refs, tmp_path / "out", PNG) == 3
     check(EpisodeSource(tmp_path / "out"), episodes, tolerance=0)
+    assert EpisodeSource(tmp_path / "out").verify() > 5
+    stats = json.loads((tmp_path / "out" / "meta" / "stats.json").read_text())
+    assert list(stats) == sorted(stats), "an order of a set would differ between processes"
     assert not (tmp_path / "out.partial").exists()
 
 
