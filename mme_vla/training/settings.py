@@ -37,7 +37,7 @@ class TrainSettings:
     schedule_steps: int | None = None
     schedule_end: Annotated[float, Range(0, 1)] = 0.0
     milestones: tuple[PositiveInt, ...] = ()
-    gamma: Annotated[float, Range(most=1, above=0)] = 0.1
+    gamma: float = 0.1
     decay_min_dim: NonNegativeInt = 0
     ema_warmup: bool = False
     accumulate: PositiveInt = 1
@@ -68,6 +68,7 @@ class TrainSettings:
                 steps is None or steps >= max(self.warmup, 1), f"no fewer than train.warmup={self.warmup}, or null"
             ),
             "milestones": (milestones == sorted(milestones), "updates in ascending order, such as [1000, 2000]"),
+            "gamma": (0 < self.gamma <= 1, "above 0 and at most 1"),
             "ema": (0 <= self.ema < 1, "at least 0 (no averaging) and below 1"),
             "betas": (all(0 <= beta < 1 for beta in self.betas), "two numbers in [0, 1)"),
             "batch_size": (not self.batch_size % self.accumulate, f"a multiple of train.accumulate={self.accumulate}"),
