@@ -50,9 +50,10 @@ def test_health_metadata_and_statistics(served):
     assert ask(served, "GET", "/healthz") == (200, "text/plain; charset=utf-8", b"OK\n")
     status, kind, body = ask(served, "GET", "/metadata")
     assert (status, kind) == (200, "application/msgpack") and unpack(body)["action_space"] == "joint_angle"
+    before = json.loads(ask(served, "GET", "/stats")[2])["counts"]
     by_http(served, course())
     stats = json.loads(ask(served, "GET", "/stats")[2])
-    assert stats["counts"]["infer"] == 3 and stats["counts"]["batched"] == 3
+    assert [stats["counts"][kind] - before.get(kind, 0) for kind in ("infer", "batched")] == [3, 3]
     assert 0 < stats["latency_ms"]["infer"]["p50"] <= stats["latency_ms"]["infer"]["p95"]
 
 
