@@ -8,12 +8,12 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what to do."""
 
 
-def raise_if(condition: object, message: str, error: type[Exception] = UserError) -> None:
-    """Raise an error with this message where the condition holds.
+def require(holds: object, message: str, error: type[Exception] = UserError) -> None:
+    """Raise an error with this message unless something holds.
 
     The message is made in either case: for checks in a hot loop, or of a value it cannot name, write `if` and `raise`.
     """
-    if condition:
+    if not holds:
         raise error(message)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 from mme_vla.utils import Sums, decoding, files_to_hold, read_json, require_file, user_cache
 
@@ -44,7 +44,7 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
         encoder: hash of the vision tower's weights (`policy.vision_fingerprint()`).
         dtype: `bfloat16` or `float32`.
     """
-    raise_if(dtype not in DTYPES, f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
+    require(dtype in DTYPES, f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
     return {
         "format": FORMAT,
         "encoder": encoder,
@@ -116,8 +116,8 @@ class VisionCache:
                 f"Finish it with: {command}"
             )
         widths = {self._tokens(episode).shape[-1] for episode in range(len(source))}
-        raise_if(
-            len(widths) > 1, f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true"
+        require(
+            len(widths) <= 1, f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true"
         )
         self.width = widths.pop()
         self.max_open = files_to_hold(len(source))
@@ -159,8 +159,8 @@ class VisionCache:
         rows = len(stored_frames(self._source, episode, self.spec))
         with decoding(require_file(path), "tokens of a vision cache", self._remedy):
             tokens = np.lib.format.open_memmap(path, mode="r")
-        raise_if(
-            tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype,
+        require(
+            tokens.ndim == 3 and tokens.shape[:2] == (rows, self.spec.grid**2) and tokens.dtype == self._dtype,
             f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
             f"{self.spec.grid**2}, d] is expected. {self._remedy}",
         )
@@ -173,14 +173,14 @@ class VisionCache:
         with decoding(require_file(path), "scores of a vision cache", self._remedy), np.load(path) as stored:
             frames, values = stored["frames"], stored["values"]
         length, patches = int(self._lengths[episode]), self.spec.grid**2
-        raise_if(
+        require(
             (
-                (frames.dtype, values.dtype) != (np.int64, np.float32)
-                or frames.ndim != 1
-                or values.shape != (len(frames), patches)
-                or (frames < 0).any()
-                or (frames >= length).any()
-                or not np.isfinite(values).all()
+                (frames.dtype, values.dtype) == (np.int64, np.float32)
+                and frames.ndim == 1
+                and values.shape == (len(frames), patches)
+                and not (frames < 0).any()
+                and not (frames >= length).any()
+                and np.isfinite(values).all()
             ),
             f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames "
             f"{list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below {length} are "

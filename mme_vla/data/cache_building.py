@@ -34,7 +34,7 @@ from mme_vla.data.cache import (
 )
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, frames_scored, make_scorer
 from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
 
@@ -187,7 +187,7 @@ def _build_episode(
                 raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames")
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
-    raise_if(not rows, f"{source.name}, episode {episode}: none of the frames that the memory stores was rendered.")
+    require(rows, f"{source.name}, episode {episode}: none of the frames that the memory stores was rendered.")
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)

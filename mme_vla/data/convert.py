@@ -22,7 +22,7 @@ from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
@@ -121,10 +121,10 @@ class ConvertOptions:
     names: str = "robomme"
 
     def __post_init__(self) -> None:
-        raise_if(self.images not in ("video", "png"), f"images={self.images!r}: expected 'video' or 'png'.")
+        require(self.images in ("video", "png"), f"images={self.images!r}: expected 'video' or 'png'.")
         if self.names not in NAMES:
             raise UserError(f"names={self.names!r} is no spelling of columns. {did_you_mean(str(self.names), NAMES)}")
-        raise_if(self.fps < 1 or self.gop < 1, f"fps={self.fps} and video.gop={self.gop} must be positive.")
+        require(self.fps >= 1 and self.gop >= 1, f"fps={self.fps} and video.gop={self.gop} must be positive.")
 
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
@@ -162,7 +162,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     A run that was interrupted is continued by calling again with the same arguments. The files are told by their
     content, so one that has changed since is noticed.
     """
-    raise_if(not episodes, "There is no episode to convert.")
+    require(episodes, "There is no episode to convert.")
     options = replace(options or ConvertOptions(), **recorded_options(episodes))
     plan = _plan(episodes, options)
     partial = _work_folder(output)
@@ -213,8 +213,8 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
 def _convert(
     episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
 ) -> int:
-    raise_if(
-        not claim_plan(partial, plan),
+    require(
+        claim_plan(partial, plan),
         f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
         "that one to finish it, choose another output, or remove that folder yourself.",
     )

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
 from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
@@ -79,15 +79,15 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
             seed: of all randomness.
         """
-        raise_if(
-            memory is not None and (caches is None or len(caches) != len(sources)),
+        require(
+            memory is None or (caches is not None and len(caches) == len(sources)),
             "A policy with memory trains on cached vision tokens, one cache a source: build them with "
             "`mme-vla cache model=<model> data=<data>` and pass `caches`.",
         )
         if not 0 <= action_offset <= 1:
             raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
-        raise_if(
-            processor.prompt_spec.reads_subgoal and subgoal is None,
+        require(
+            not processor.prompt_spec.reads_subgoal or subgoal is not None,
             f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set subgoal_text.kind to "
             "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain.",
         )
@@ -102,7 +102,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
         pairs = zip(self._source, self._episode, strict=True)
         self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
-        raise_if(not self.steps, "The data hold no execution step of this robot.")
+        require(self.steps, "The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
         return self.steps
@@ -235,8 +235,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:
     for source in sources:
         lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
-        raise_if(
-            lacking,
+        require(
+            not lacking,
             f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
             f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}.",
         )

@@ -36,7 +36,7 @@ from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
-from mme_vla.errors import UserError, brief, did_you_mean, raise_if
+from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.utils import Sums, decoding, read_json
 
 SIDE_FILE = "meta/robomme_episodes.json"
@@ -170,8 +170,8 @@ class EpisodeSource:
         letters = len(self.robot.action.choice)
         if not letters:
             return ()
-        raise_if(
-            episode >= len(self.records) or "options" not in self.records[episode],
+        require(
+            episode < len(self.records) and "options" in self.records[episode],
             f"{self.root / SIDE_FILE} does not say which options episode {episode} offered, and the robot "
             f"{self.robot.name!r} chooses among them. Convert or record the dataset again.",
         )
@@ -275,9 +275,7 @@ class EpisodeSource:
         if not len(indices) or indices.min() < 0 or indices.max() >= length:
             raise UserError(f"{self.name}, episode {episode}: frames {indices.tolist()[:5]} asked of {length}.")
         camera = self.robot.memory_camera if camera is None else camera
-        raise_if(
-            camera not in self.columns, f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}"
-        )
+        require(camera in self.columns, f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
         if not (rendered := self.rendered(episode, camera)[indices]).all():
             raise UserError(
                 f"{self.name}, episode {episode}: {camera} was not rendered at frames "
@@ -316,8 +314,8 @@ class EpisodeSource:
         index = _flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
         total = int(self.lengths.sum())  # before anything of that size is made
         expected = np.repeat(np.arange(len(self)), self.lengths) if len(index) == total else None
-        raise_if(
-            expected is None or not np.array_equal(index.to_numpy(zero_copy_only=False), expected),
+        require(
+            expected is not None and np.array_equal(index.to_numpy(zero_copy_only=False), expected),
             f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total} in "
             f"{len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or convert it again.",
         )

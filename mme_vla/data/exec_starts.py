@@ -14,7 +14,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import listed, raise_if
+from mme_vla.errors import listed, require
 
 NEAR = 0.05  # radians on average: a demonstration that was made anew differs a little, another episode by far more
 _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
@@ -60,11 +60,11 @@ def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> 
         starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
         near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
         place = f"{source.root}, episode {episode}"
-        raise_if(
-            nearest > NEAR,
+        require(
+            nearest <= NEAR,
             f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes given: {near}. Give "
             "the recordings that the dataset was made from, all of them.",
         )
-        raise_if(len(starts) > 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
+        require(len(starts) <= 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
         matches.append(starts[0])
     return matches

@@ -20,7 +20,7 @@ from mme_vla.data.hdf5 import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.methods.sam2act.processor import Shot
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.utils import require_file, write_atomically
@@ -225,8 +225,8 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
                 counted[source.task(episode)] += 1
                 shares += [1.0 if length == 1 else 1 / len(keyframes.chains)] * len(runs)
                 tasks += [source.task(episode)] * len(runs)
-        raise_if(
-            not self._items,
+        require(
+            self._items,
             f"No chain of keyframes in the data has {length} of them; the longest has {longest}. Train on longer "
             "tasks, or remember fewer (backbone.remembered).",
         )

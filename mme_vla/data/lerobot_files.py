@@ -17,7 +17,7 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Camera, Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
-from mme_vla.errors import UserError, brief, listed, raise_if
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
@@ -64,8 +64,8 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
         matches["action"] = _first(_ACTION, features)
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
     missing = [keys.get(name, name) for name, column in matches.items() if column is None]
-    raise_if(
-        missing,
+    require(
+        not missing,
         f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
         f"These are the names of the robot {robot.name!r}: choose embodiment=<the robot this dataset is of>, or "
         "name its columns in a configs/embodiment file of your own. (RoboMME's poses and waypoints are columns of "
@@ -74,8 +74,8 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     columns = {name: str(column) for name, column in matches.items()}
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
-        raise_if(
-            features[column]["dtype"] not in ("image", "video"),
+        require(
+            features[column]["dtype"] in ("image", "video"),
             f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be the camera "
             f"{name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key).",
         )
@@ -143,15 +143,15 @@ def resolve_root(root: str | Path) -> Path:
     """Return the dataset folder; `sample` names the one in the package."""
     path = SAMPLE if str(root) == "sample" else Path(root).expanduser()
     info = path / "meta" / "info.json"
-    raise_if(
-        not info.is_file(),
+    require(
+        info.is_file(),
         f"No LeRobot dataset at {str(root)!r} (there is no {info}). Give its local folder, or 'sample'. From the "
         "hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir <folder>`; from HDF5 files: "
         "`mme-vla convert input=<files> output=<folder>`.",
     )
     version = brief(read_info(path).get("codebase_version", "unknown"), quote=False)
-    raise_if(
-        not version.startswith("v3."),
+    require(
+        version.startswith("v3."),
         f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own command: "
         f"`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name} --root={path} "
         "--push-to-hub=false`.",
@@ -220,7 +220,9 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
             raise UserError(f"{file} says {brief(pair[1])} of episode {brief(pair[0])}. {expected}")
     table = dict(pairs)
     lost = [episode for episode in range(episodes) if episode not in table]
-    raise_if(lost, f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all {episodes}.")
+    require(
+        not lost, f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all {episodes}."
+    )
     return np.array([table[episode] for episode in range(episodes)], np.int64)
 
 
@@ -275,8 +277,8 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
         empty = [name for name in schema.names if table[name].null_count]
         columns = {name: table[name].to_numpy() for name, _ in fields}
         tasks = [texts[0] if texts else None for texts in table["tasks"].to_pylist()]
-    raise_if(
-        empty or not table.num_rows,
+    require(
+        not empty and table.num_rows,
         f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}. {REMEDY}",
     )
     starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]

@@ -10,7 +10,7 @@ import numpy as np
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ def split_episodes(
             )
         named.setdefault(source_name or sources[0].name, []).append(int(number))
     unknown = set(named) - {source.name for source in sources}
-    raise_if(
-        unknown,
+    require(
+        not unknown,
         f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
         f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[].",
     )
-    raise_if(not 0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
+    require(0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
     split = Split([], [])
     for source in sources:
         episodes = np.arange(len(source))
         if source.name in named:
             wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
-            raise_if(
-                wrong,
+            require(
+                not wrong,
                 f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
                 "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1",
             )
@@ -84,13 +84,13 @@ def open_sources(
     `robot` says which columns hold its images, states and actions.
     """
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
-    raise_if(not listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
+    require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
     sources = []
     for entry in listed:
         options = {"root": entry} if isinstance(entry, str) else dict(entry)
         for key in options:
-            raise_if(key not in _KEYS, f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
-        raise_if(not options.get("root"), "A data source needs its dataset folder: root=<folder>, or 'sample'.")
+            require(key in _KEYS, f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
+        require(options.get("root"), "A data source needs its dataset folder: root=<folder>, or 'sample'.")
         sources.append(EpisodeSource(**options, robot=robot))
     names = [source.name for source in sources]
     if len(set(names)) < len(names):

@@ -8,7 +8,7 @@ import torch
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
@@ -42,7 +42,7 @@ def compute_norm_stats(
         video: count the conditioning video's steps too.
     """
     steps = _counted_steps(sources, episodes, video)
-    raise_if(len(steps) < 2, f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
+    require(len(steps) >= 2, f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
     if not every:
         np.random.default_rng(seed).shuffle(steps)
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)

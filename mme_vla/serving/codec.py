@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, missing_extra, raise_if
+from mme_vla.errors import UserError, missing_extra, require
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
 MOST_OBJECTS = 2**20  # values of a message, whatever holds them; a frame with all its cameras takes about 130
@@ -124,7 +124,7 @@ def _array(fields: dict[Any, Any]) -> np.ndarray:
     data: Any = fields.get(b"data")
     if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
         raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
-    raise_if(not isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")
+    require(isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")
     needed = math.prod(shape) * dtype.itemsize
     if len(data) != needed:
         raise UserError(f"An array {dtype} {shape} takes {needed} bytes, but {len(data)} were sent.")

@@ -13,7 +13,7 @@ import numpy as np
 
 from mme_vla.config.devices import find_device
 from mme_vla.embodiment.robomme import CAMERAS, check_benchmark
-from mme_vla.errors import UserError, missing_extra, raise_if
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.prompt import subgoal_kind
@@ -76,13 +76,13 @@ class MMEVLAModelServer(PredictModelServer):
         self.policy = checkpoint.eval()
         robot = self.policy.embodiment
         check_benchmark(robot, SPACES)
-        raise_if(
-            robot.readings,
+        require(
+            not robot.readings,
             f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it cannot be served "
             "to it. Evaluate it with python -m mme_vla.evaluate.",
         )
-        raise_if(
-            robot.action.of_pose,
+        require(
+            not robot.action.of_pose,
             f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
             "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate.",
         )
@@ -174,7 +174,7 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
     host, port = options.host, options.port
     if options.address:
         name, _, number = options.address.rpartition(":")
-        raise_if(not number.isdecimal(), f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.")
+        require(number.isdecimal(), f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.")
         host, port = name or host, int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):

@@ -13,7 +13,7 @@ import numpy as np
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.utils import is_text
 
 POSE = (3, 4)
@@ -61,7 +61,7 @@ def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple
             array = np.empty(0, object)
         fits = array.dtype.kind in "fiu" and array.shape in (shape, (*shape, 1))
         got = f"{array.dtype} {list(array.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
-        raise_if(not fits, f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
+        require(fits, f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
         readings.append(_numbers(key, array).reshape(shape))
     return np.stack(readings)
 
@@ -126,16 +126,16 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     Args:
         most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
     """
-    raise_if(not isinstance(message, dict), f"A request is a map, got {type(message).__name__}.")
+    require(isinstance(message, dict), f"A request is a map, got {type(message).__name__}.")
     space_name = robot.action.answers
     space = message.get("action_space", space_name)
-    raise_if(space != space_name, f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
+    require(space == space_name, f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
-    raise_if(
-        robot.action.of_pose and "action_space" not in message,
+    require(
+        not robot.action.of_pose or "action_space" in message,
         f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
         f"send action_space={space_name!r} in the request to confirm it.",
     )
@@ -144,8 +144,8 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     if any(isinstance(key, str) and key.startswith("observation/") for key in message):
         return _observation(message, robot)
     keys = [key for key in message if isinstance(key, str)][:10]
-    raise_if(
-        keys and set(keys) <= set(KNOWN),  # flags: true was handled above
+    require(
+        not keys or set(keys) > set(KNOWN),  # flags: true was handled above
         f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
         "keys observation/image, … or front_rgb_list, …",
     )
@@ -165,8 +165,8 @@ def _flag(message: dict[Any, Any], key: str) -> bool:
 
 
 def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> AddBuffer:
-    raise_if(
-        robot.readings,
+    require(
+        not robot.readings,
         f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
         "past frames in the challenge's lists, and the current one in either schema.",
     )
@@ -177,14 +177,14 @@ def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) ->
     frames = _frames("images", list(images[:, 0]), most_frames)
     states = _numbers("state", _array(message, "state"))
     width = robot.state.width
-    raise_if(
-        states.shape != (count, width), f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}."
+    require(
+        states.shape == (count, width), f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}."
     )
     start = message.get("exec_start_idx", 0)
     if isinstance(start, np.integer):
         start = int(start)
-    raise_if(
-        type(start) is not int or start < 0, f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}."
+    require(
+        type(start) is int and start >= 0, f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}."
     )
     return AddBuffer(frames, start, states)
 
@@ -205,8 +205,8 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
-    raise_if(
-        robot.action.space is None, f"The robot {robot.name!r} is not the benchmark's: send observation/… messages."
+    require(
+        robot.action.space is not None, f"The robot {robot.name!r} is not the benchmark's: send observation/… messages."
     )
     keys = {name: f"{name}_rgb_list" for name in robot.camera_names}
     views = {name: _frames(key, _get(message, key), most_frames) for name, key in keys.items()}
@@ -218,9 +218,7 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
         counts = ", ".join(f"{key} has {length}" for key, length in lengths.items())
         raise UserError(f"All lists need one entry a frame: {counts}.")
     first = _get(message, "is_first_step")
-    raise_if(
-        not isinstance(first, bool | np.bool_), f"is_first_step must be true or false, got {type(first).__name__}."
-    )
+    require(isinstance(first, bool | np.bool_), f"is_first_step must be true or false, got {type(first).__name__}.")
     goal = _text("task_goal", _get(message, "task_goal"))
     states = np.stack([benchmark_state(*proprio) for proprio in zip(joints, grippers, strict=True)])
     images = {name: view[-1] for name, view in views.items()}
@@ -255,15 +253,15 @@ def _array(message: dict[Any, Any], key: str) -> np.ndarray:
             value = np.asarray(value)
         except (ValueError, TypeError, OverflowError):
             value = None
-    raise_if(not isinstance(value, np.ndarray), f"{key} must be an array.")
+    require(isinstance(value, np.ndarray), f"{key} must be an array.")
     return value
 
 
 def _numbers(key: str, value: np.ndarray) -> np.ndarray:
-    raise_if(value.dtype.kind not in "fiu", f"{key} must hold numbers, got dtype {value.dtype}.")
+    require(value.dtype.kind in "fiu", f"{key} must hold numbers, got dtype {value.dtype}.")
     with np.errstate(over="ignore"):
         numbers = value.astype(np.float32)
-    raise_if(not np.isfinite(numbers).all(), f"{key} holds numbers that are not finite.")
+    require(np.isfinite(numbers).all(), f"{key} holds numbers that are not finite.")
     return numbers
 
 
@@ -271,21 +269,21 @@ def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
     rows = _get(message, key)
     if isinstance(rows, np.ndarray):
         rows = list(rows) if rows.ndim else None
-    raise_if(not isinstance(rows, list), f"{key} must be a list of arrays [{size}].")
+    require(isinstance(rows, list), f"{key} must be a list of arrays [{size}].")
     arrays = [_numbers(key, _array({key: row}, key)) for row in rows]
     for row in arrays:
-        raise_if(row.shape != (size,), f"{key} must hold arrays [{size}], got {list(row.shape)}.")
+        require(row.shape == (size,), f"{key} must hold arrays [{size}], got {list(row.shape)}.")
     return arrays
 
 
 def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
-    raise_if(not isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
+    require(isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
     if not 1 <= len(frames) <= most:
         raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
     shapes = {_image(key, frame).shape for frame in frames}
-    raise_if(len(shapes) > 1, f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
+    require(len(shapes) <= 1, f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
 
 
@@ -293,12 +291,13 @@ def _image(key: str, image: Any) -> np.ndarray:
     array = isinstance(image, np.ndarray)
     got = f"{image.dtype} {list(image.shape)}" if array else type(image).__name__
     fits = array and image.dtype == np.uint8 and image.ndim == 3 and image.shape[-1] == 3
-    raise_if(not fits, f"{key} must be a uint8 image [height, width, 3], got {got}.")
+    require(fits, f"{key} must be a uint8 image [height, width, 3], got {got}.")
     low, high = sorted(image.shape[:2])
-    raise_if(
-        low < SIDES[0] or high > SIDES[1], f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}."
+    require(
+        low >= SIDES[0] and high <= SIDES[1],
+        f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}.",
     )
-    raise_if(high > 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
+    require(high <= 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
     checked: np.ndarray = image
     return checked
 
@@ -308,6 +307,6 @@ def _text(key: str, value: Any) -> str:
         value = value[0]  # the benchmark gives a goal as a list of wordings
     if not isinstance(value, str):
         raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
-    raise_if(len(value) > MOST_GOAL, f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
-    raise_if(not is_text(value), f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
+    require(len(value) <= MOST_GOAL, f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
+    require(is_text(value), f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
     return str(value)

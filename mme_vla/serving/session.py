@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import benchmark_action
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import unpack
 from mme_vla.serving.engine import Engine
@@ -155,8 +155,8 @@ class Session:
 
     def _check_capacity(self, count: int) -> None:
         total, most = self.episode.n_observed_frames + count, self._settings.limits.frames
-        raise_if(
-            total > most,
+        require(
+            total <= most,
             f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
             "episodes.",
         )

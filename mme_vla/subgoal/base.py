@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.text import KINDS, MalformedReply, Parsed, Point
 
@@ -130,8 +130,8 @@ class SubgoalPredictor:
     episode_type: type[SubgoalEpisode] = SubgoalEpisode
 
     def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
-        raise_if(kind not in KINDS, f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
-        raise_if(interval < 1, f"subgoal.interval={interval} must be a positive number of steps.")
+        require(kind in KINDS, f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
+        require(interval >= 1, f"subgoal.interval={interval} must be a positive number of steps.")
         self.kind, self.interval = kind, interval
         self.usage = Usage()
         self.settings: dict[str, Any] = {}

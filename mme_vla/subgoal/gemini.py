@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.processing.prompt import POINT
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
@@ -191,7 +191,7 @@ class PromptedPredictor(SubgoalPredictor):
         self, kind: str, interval: int, workers: int, api: str, client: Any, settings: Mapping[str, Any]
     ) -> None:
         super().__init__(kind, interval)
-        raise_if(workers < 1, f"workers={workers} must be at least 1: questions under way at once.")
+        require(workers >= 1, f"workers={workers} must be at least 1: questions under way at once.")
         self.workers = workers
         self.api = make_api(api, settings, "subgoal", self.usage, client)
         self._lock = threading.Lock()
@@ -231,7 +231,7 @@ class Gemini(PromptedPredictor):
         **settings: Any,
     ) -> None:
         super().__init__(kind, interval, workers, self.provider, client, settings)
-        raise_if(wait < 0, f"wait={wait} must be a number of steps, 0 or more.")
+        require(wait >= 0, f"wait={wait} must be a number of steps, 0 or more.")
         self.wait = wait
 
     def due(self, episode: SubgoalEpisode) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import brief, raise_if
+from mme_vla.errors import brief, require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
@@ -112,8 +112,8 @@ class Route:
     done: int = 0
 
     def check(self, before: "Route | None", finished: bool) -> None:
-        raise_if(self.done > len(self.steps), f"{self.done} of {len(self.steps)} steps cannot be done", MalformedReply)
-        raise_if(before is not None and before.steps != self.steps, "the steps of a route were changed", MalformedReply)
+        require(self.done <= len(self.steps), f"{self.done} of {len(self.steps)} steps cannot be done", MalformedReply)
+        require(before is None or before.steps == self.steps, "the steps of a route were changed", MalformedReply)
         if before is not None and not before.done <= self.done <= before.done + finished:
             raise MalformedReply(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
 
@@ -141,7 +141,7 @@ class Notebook:
                 raise MalformedReply(f"{brief(name)} was another kind of note before")
             note.check(before, finished is not None)  # type: ignore[arg-type]
             notes[name] = note
-        raise_if(len(notes) > MOST_NOTES, f"the notebook takes {MOST_NOTES} notes", MalformedReply)
+        require(len(notes) <= MOST_NOTES, f"the notebook takes {MOST_NOTES} notes", MalformedReply)
         return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
 
     def in_words(self) -> str:
@@ -174,8 +174,8 @@ def _read(entry: dict[str, Any]) -> Note:
         return Identity(_words(entry.get("words"), "words"))
     if kind == "route":
         steps: Any = entry.get("steps")
-        raise_if(
-            not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS,
+        require(
+            isinstance(steps, list) and 1 <= len(steps) <= MOST_STEPS,
             f"steps is not a list of 1 to {MOST_STEPS} texts",
             MalformedReply,
         )
@@ -186,7 +186,7 @@ def _read(entry: dict[str, Any]) -> Note:
 def _words(value: Any, what: str) -> str:
     if not isinstance(value, str) or not is_text(value) or not (text := " ".join(value.split())):
         raise MalformedReply(f"the {what} of a note is no text")
-    raise_if(len(text) > MOST_WORDS, f"the {what} of a note has more than {MOST_WORDS} characters", MalformedReply)
+    require(len(text) <= MOST_WORDS, f"the {what} of a note has more than {MOST_WORDS} characters", MalformedReply)
     return text
 
 
@@ -266,7 +266,7 @@ class NotebookPredictor(PromptedPredictor):
             query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
             replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
             done: Any = json_object(replies[-1]).get("done")
-            raise_if(not isinstance(done, bool), "the monitor's answer does not say whether it is done", MalformedReply)
+            require(isinstance(done, bool), "the monitor's answer does not say whether it is done", MalformedReply)
             episode.agreed = done
         return episode.agreed
 

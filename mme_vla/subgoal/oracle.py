@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.text import points_of
@@ -23,8 +23,8 @@ class Oracle(SubgoalPredictor):
         return [self._read(episode) for episode in episodes]
 
     def _read(self, episode: SubgoalEpisode) -> Subgoal:
-        raise_if(
-            not isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str),
+        require(
+            isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str),
             f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…, info); it reports "
             f"{sorted(map(str, episode.info)) or 'nothing'}.",
         )

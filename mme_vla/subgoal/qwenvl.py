@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
@@ -37,7 +37,7 @@ class VLMPredictor(SubgoalPredictor):
         vlm: VLM | None = None,
     ) -> None:
         super().__init__(kind, interval)
-        raise_if(max_new_tokens < 1, f"max_new_tokens={max_new_tokens} must be at least 1.")
+        require(max_new_tokens >= 1, f"max_new_tokens={max_new_tokens} must be at least 1.")
         self.max_new_tokens = max_new_tokens
         self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=batch_size)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.utils import is_text, parse_json
 
 IMAGE, VIDEO, BBOX = "<image>", "<video>", "<bbox>"
@@ -153,13 +153,15 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
 def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
     """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points."""
     text = " ".join(reply.split())
-    raise_if(not text, "the answer is empty", MalformedReply)
+    require(text, "the answer is empty", MalformedReply)
     pixels = [(int(y), int(x)) for y, x in _BOX.findall(text)]
-    raise_if(
-        any(value > THOUSAND for point in pixels for value in point), "a point lies outside 0…1000", MalformedReply
+    require(
+        not any(value > THOUSAND for point in pixels for value in point), "a point lies outside 0…1000", MalformedReply
     )
-    raise_if(
-        _BOX_MARK.search(_BOX.sub("", text)), "a point is not of the form <|box_start|>(a,b)<|box_end|>", MalformedReply
+    require(
+        not _BOX_MARK.search(_BOX.sub("", text)),
+        "a point is not of the form <|box_start|>(a,b)<|box_end|>",
+        MalformedReply,
     )
     points = tuple((to_pixels(y, side), to_pixels(x, side)) for y, x in pixels)
     values = iter(points)
@@ -180,9 +182,9 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
     fields = json_object(reply)
     subtask: Any = fields.get("current_subtask")
     positions: Any = fields.get("keyframe_positions", [])
-    raise_if(not isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
-    raise_if(
-        not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
+    require(isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
+    require(
+        isinstance(positions, list) and not any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
         "keyframe_positions is not a list of whole numbers",
         MalformedReply,
     )
@@ -199,7 +201,7 @@ def parse_gemini(reply: str) -> str:
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
     text: Any = json_object(reply).get("subgoal")
-    raise_if(not isinstance(text, str) or not text.strip(), "the answer names no subgoal", MalformedReply)
+    require(isinstance(text, str) and text.strip(), "the answer names no subgoal", MalformedReply)
     return _writable(text.strip())
 
 
@@ -236,7 +238,7 @@ def points_of(text: str) -> tuple[Point, ...]:
 def json_object(reply: str) -> dict[str, Any]:
     """The outermost braces of an answer as JSON."""
     start, stop = reply.find("{"), reply.rfind("}")
-    raise_if(start < 0 or stop < start, "the answer holds no JSON object", MalformedReply)
+    require(start >= 0 and stop >= start, "the answer holds no JSON object", MalformedReply)
     try:
         fields: dict[str, Any] = parse_json(reply[start : stop + 1], "the answer", finite=False)
     except UserError as error:
@@ -246,5 +248,5 @@ def json_object(reply: str) -> dict[str, Any]:
 
 def _writable(text: str) -> str:
     """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
-    raise_if(not is_text(text), "the answer holds half a character", MalformedReply)
+    require(is_text(text), "the answer holds half a character", MalformedReply)
     return text

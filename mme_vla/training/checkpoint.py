@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor, distributed, nn
 
-from mme_vla.errors import UserError, listed, raise_if
+from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
 from mme_vla.policy.saving import save_settings
@@ -180,8 +180,8 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
 def read_state(checkpoint: Path) -> dict[str, Any]:
     """What `training_state.json` says."""
     path = checkpoint / STATE
-    raise_if(
-        not path.is_file(),
+    require(
+        path.is_file(),
         f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
         f"To start a new run from its weights use init_from={checkpoint}.",
     )
@@ -194,8 +194,8 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:
         raise UserError(f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older one.")
     shards = state.get("shards", 0)
-    raise_if(
-        len(shard_files(checkpoint)) != shards,
+    require(
+        len(shard_files(checkpoint)) == shards,
         f"{checkpoint} holds {len(shard_files(checkpoint))} of the {shards} files that its processes wrote: it is "
         "incomplete. Copy the whole folder again, or resume from an older checkpoint.",
     )
@@ -215,8 +215,8 @@ def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = Fal
     needed = (weights * (1 + sharded) + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
-    raise_if(
-        needed > free,
+    require(
+        needed <= free,
         f"Checkpoints would take {needed / 1e9:.1f} GB in {folder} (train.keep.last={keep.last} and the one being "
         f"written), but {free / 1e9:.1f} GB are free: make room, keep fewer, or choose another output.",
     )
@@ -272,8 +272,8 @@ def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str,
         if not (scalar and name.endswith(scalar))
         and (tensors[name].shape, tensors[name].dtype) != (expected[name].shape, expected[name].dtype)
     ]
-    raise_if(
-        wrong,
+    require(
+        not wrong,
         f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
         "It belongs to another model or other settings.",
     )

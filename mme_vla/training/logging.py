@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from mme_vla.errors import UserError, missing_extra, raise_if
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 from mme_vla.utils import read_lines, write_atomically
@@ -80,8 +80,8 @@ class Window:
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds
         values["speed/waiting_for_data"] = self._waited / seconds
         broken = [name for name, value in values.items() if not math.isfinite(value)]
-        raise_if(
-            broken,
+        require(
+            not broken,
             f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was saved. "
             "Resume from the last checkpoint with a lower train.lr in a new run (init_from=…), "
             "or look for broken values in the data (python -m mme_vla.inspect dataset=…).",

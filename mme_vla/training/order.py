@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 
 
@@ -39,13 +39,13 @@ class BatchOrder:
         process: int = 0,
         processes: int = 1,
     ) -> None:
-        raise_if(
-            samples < batch_size,
+        require(
+            samples >= batch_size,
             f"The training split has {samples} samples, fewer than train.batch_size={batch_size}: "
             "lower the batch size or add data.",
         )
-        raise_if(
-            batch_size % (accumulate * processes),
+        require(
+            not (batch_size % (accumulate * processes)),
             f"train.batch_size={batch_size} counts the samples of one update over all processes: it must be a "
             f"multiple of {processes} processes × train.accumulate={accumulate}.",
         )

@@ -19,7 +19,7 @@ from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
 from mme_vla.config.sections import PositiveInt
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import recompute_buffers
 from mme_vla.speed import Sharded
@@ -39,8 +39,8 @@ class ParallelSettings:
     def shards(self, device: torch.device) -> bool:
         """Whether this run shards its weights: where that is asked for, and of itself on several GPUs."""
         started = distributed.is_available() and distributed.is_initialized()
-        raise_if(
-            self.strategy == "fsdp" and not started,
+        require(
+            self.strategy != "fsdp" or started,
             "train.parallel.strategy=fsdp shares the weights among processes, and this one was started alone: "
             "start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or leave the strategy at auto.",
         )
@@ -53,7 +53,9 @@ class ParallelSettings:
         world = distributed.get_world_size()
         nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
         copies = nodes if self.replicate is None else self.replicate
-        raise_if(world % copies, f"train.parallel.replicate={copies} must divide the number of processes, {world}.")
+        require(
+            not (world % copies), f"train.parallel.replicate={copies} must divide the number of processes, {world}."
+        )
         if copies == 1:
             return init_device_mesh(device_type, (world,), mesh_dim_names=("shard",))
         return init_device_mesh(device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard"))

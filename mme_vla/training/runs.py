@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, newest_checkpoint, resolve_checkpoint, step_of
 from mme_vla.policy.saving import policy_name
@@ -82,8 +82,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         config: the composed configuration, plain.
     """
     if resume is None:
-        raise_if(
-            _holds_run(folder),
+        require(
+            not _holds_run(folder),
             f"{folder} already holds a training run, which is never overwritten: "
             f"continue it with resume={folder}, or choose another output.",
         )
@@ -104,13 +104,13 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."
         )
     steps = config["train"]["steps"]
-    raise_if(
-        state["step"] > steps,
+    require(
+        state["step"] <= steps,
         f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give as many or more.",
     )
     newer = [path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]]
-    raise_if(
-        newer,
+    require(
+        not newer,
         f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which continuing from "
         f"{checkpoint.name} would overwrite: resume from the newest, or move those away.",
     )
@@ -205,8 +205,8 @@ ASK, NONE = "ask", "none"
 
 def weights_to_start_from(init_from: str | None) -> str | None:
     """What `init_from` names; None for random weights."""
-    raise_if(
-        init_from == ASK,
+    require(
+        init_from != ASK,
         "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
         "To train the whole network from random weights, say so: init_from=none.",
     )

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self
 
 from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, PositiveInt, Range, read_section
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.speed.recompute import SELECTIVE, Recompute
 from mme_vla.training.parallel import ParallelSettings
 
@@ -74,7 +74,7 @@ class TrainSettings:
             "batch_size": (not self.batch_size % self.accumulate, f"a multiple of train.accumulate={self.accumulate}"),
         }  # fmt: skip
         for name, (fits, expected) in checks.items():
-            raise_if(not fits, f"train.{name}={getattr(self, name)!r} must be {expected}.")
+            require(fits, f"train.{name}={getattr(self, name)!r} must be {expected}.")
 
     @property
     def recomputation(self) -> Recompute:

@@ -23,7 +23,7 @@ from torch.distributed.checkpoint.api import CheckpointException
 from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
 from torch.distributed.tensor import DTensor
 
-from mme_vla.errors import listed, raise_if
+from mme_vla.errors import listed, require
 from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
 from mme_vla.utils import Sums, decoding, inside, sum_line
@@ -142,7 +142,7 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
         for path in (file, note):
             inside(checkpoint, path.relative_to(checkpoint).as_posix())
         sums[file] = Sums(file.parent, note.name)
-        raise_if(file.name not in sums[file].table, f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
+        require(file.name in sums[file].table, f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
         check_header(file)
     for file in files[rank::world]:  # all together compare each file once
         sums[file].check(file.name)
@@ -152,8 +152,8 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
     names = set(shapes) - set(stored) if others else set(shapes) ^ set(stored)
     wrong = sorted(names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]})
-    raise_if(
-        wrong,
+    require(
+        not wrong,
         f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
         "It belongs to another model or other settings, or a file of it is missing.",
     )

@@ -21,7 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from mme_vla.errors import UserError, brief, listed, raise_if
+from mme_vla.errors import UserError, brief, listed, require
 
 # "errno = 28" (HDF5), "os error 28" (Rust)
 _NUMBER = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
@@ -93,7 +93,7 @@ def require_file(path: Path, what: str = "a file") -> Path:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
-    raise_if(not stat.S_ISREG(mode), f"{_short_path(path)} is not a file; expected {what}.")
+    require(stat.S_ISREG(mode), f"{_short_path(path)} is not a file; expected {what}.")
     return path
 
 
@@ -132,8 +132,8 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
         resolved = Path("/")
     within = resolved.is_relative_to(root) and resolved != root
     linked = ".." not in Path(name).parts and any(resolved.is_relative_to(blobs) for blobs in _blobs_of(root))
-    raise_if(
-        not name or Path(name).is_absolute() or not (within or linked),
+    require(
+        name and not Path(name).is_absolute() and (within or linked),
         f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
         "dataset's own folder is read for it; copy the file into the folder, or correct the name.",
     )
@@ -155,8 +155,8 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 
 def safe_name(name: str, what: str = "name") -> str:
     """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most 100 characters."""
-    raise_if(
-        not isinstance(name, str) or not _SAFE_NAME.fullmatch(name),
+    require(
+        isinstance(name, str) and _SAFE_NAME.fullmatch(name),
         f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -, "
         "beginning with a letter or digit.",
     )
@@ -181,8 +181,8 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(file.fileno())
-            raise_if(not stat.S_ISREG(status.st_mode), f"{path} is not a file; expected {what}.")
-            raise_if(status.st_size > limit, f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
+            require(stat.S_ISREG(status.st_mode), f"{path} is not a file; expected {what}.")
+            require(status.st_size <= limit, f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
             return file.read(status.st_size + 1)  # reading `limit` would allocate it, whatever the size
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
@@ -305,8 +305,8 @@ def to_dataclass[T](cls: type[T], values: Mapping[str, Any]) -> T:
     types, members = _type_hints(cls), {member.name: member for member in fields(cls)}  # type: ignore[arg-type]
     required = [n for n, m in members.items() if m.default is MISSING and m.default_factory is MISSING]
     missing, unknown = sorted(set(required) - set(values)), sorted(set(values) - set(members))
-    raise_if(
-        missing or unknown,
+    require(
+        not missing and not unknown,
         f"not a {cls.__name__}: missing {listed(missing) or 'nothing'}, unknown {listed(unknown) or 'nothing'}.",
     )
     for name, value in values.items():

@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.saving import recompute_buffers
@@ -63,8 +63,8 @@ def load_weights(
     """
     kind = dtype_of(dtype)
     checkpoint = open_source(source, revision, token, base)
-    raise_if(
-        checkpoint.format == "openpi" and policy.memory is not None,
+    require(
+        checkpoint.format != "openpi" or policy.memory is None,
         f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
         "To begin training from it use start_from() (on the command line: init_from=…).",
     )
@@ -175,8 +175,8 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
         return
     source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
     processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
-    raise_if(
-        source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint,
+    require(
+        source_fingerprint is None or target_fingerprint is None or source_fingerprint == target_fingerprint,
         f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than "
         f"{processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other words. Set "
         "processor.tokenizer to that one.",

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, missing_extra, raise_if
+from mme_vla.errors import UserError, brief, missing_extra, require
 from mme_vla.utils import decoding, inside, read_text, require_file, safe_name
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
@@ -102,8 +102,8 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
         stores = {name: opened.result() for name, opened in pending.items()}
         for name, store in stores.items():  # a few bytes on disk would fill the memory
             piece = math.prod(store.chunk_layout.read_chunk.shape or ())
-            raise_if(
-                piece > max(2 * math.prod(store.shape), _SMALL_PIECE),
+            require(
+                piece <= max(2 * math.prod(store.shape), _SMALL_PIECE),
                 f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
                 f"lie in pieces of {piece:,} numbers.",
             )
@@ -116,7 +116,7 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:  # what tensorstore, or torch, cannot read
         reason = brief(str(error).splitlines()[0], 500, quote=False)
         raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
-    raise_if(not tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
+    require(tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
 
 
@@ -242,7 +242,7 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
         name, parts = entry.filename, entry.filename.split("/")
         if name.startswith("/") or "\\" in name or ".." in parts or ":" in parts[0]:
             raise UserError(f"{file} names {brief(name)}, which lies outside of it. {_REMEDY}")
-        raise_if(entry.flag_bits & 1, f"{file} is encrypted: unpack it yourself, and name the folder.")
+        require(not (entry.flag_bits & 1), f"{file} is encrypted: unpack it yourself, and name the folder.")
         if entry.file_size > _SMALL and entry.file_size > _MOST_RATIO * max(entry.compress_size, 1):
             raise UserError(f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no checkpoint.")
     if total > _SMALL and total > _MOST_RATIO * packed:
@@ -250,7 +250,7 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
     # Names and bytes that stand twice: what is compared with its checksum might not be what is read.
     names: set[str] = set()
     for entry in entries:
-        raise_if(entry.filename in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
+        require(entry.filename not in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
         names.add(entry.filename)
     ordered = sorted(entries, key=lambda entry: entry.header_offset)
     ends = [*(entry.header_offset for entry in ordered[1:]), end]
@@ -287,7 +287,7 @@ def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.Zip
             target = folder / "assets" / safe_name(above[-1]) / last
         else:
             continue
-        raise_if(entry.file_size > _SMALL, f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}")
+        require(entry.file_size <= _SMALL, f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}")
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(opened.read(entry))
     return folder

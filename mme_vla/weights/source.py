@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, did_you_mean, listed, raise_if
+from mme_vla.errors import UserError, brief, did_you_mean, listed, require
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.utils import decoding, require_file
@@ -154,8 +154,8 @@ class Source:
             if name is None:  # published runs lie in folders that are called as they are
                 name = next((folder.name for folder in beside if folder.name in VARIANTS), None)
         # The word would become part of a configuration, where it could ask for more than a name.
-        raise_if(
-            name is not None and name not in VARIANTS,
+        require(
+            name is None or name in VARIANTS,
             f"history_config.txt beside {self.folder} says {brief(name)}, no variant of the released code. "
             f"{did_you_mean(brief(name), VARIANTS)}",
         )
@@ -178,7 +178,7 @@ def open_source(
         base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for it is not followed.
     """
     path = local_folder(source, revision, token)
-    raise_if(not path.exists(), f"No checkpoint at {path}: there is no such file or folder.")
+    require(path.exists(), f"No checkpoint at {path}: there is no such file or folder.")
     if not path.is_dir():
         require_file(path, "a checkpoint")
     is_local = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
@@ -188,8 +188,8 @@ def open_source(
                 f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does not: leave it out."
             )
         base_source = open_source(base)
-        raise_if(
-            base_source.format != "openvla",
+        require(
+            base_source.format == "openvla",
             f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are OpenVLA's.",
         )
         return Source("openvla", path, base=base_source)
@@ -214,7 +214,7 @@ def open_source(
         )
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
-    raise_if(files, f"{path} holds {listed(file.name for file in files)}: name the one you mean.")
+    require(not files, f"{path} holds {listed(file.name for file in files)}: name the one you mean.")
     if (path / "adapter_model.safetensors").is_file():
         raise UserError(f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first.")
     raise UserError(f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}.")

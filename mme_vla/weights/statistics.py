@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed, raise_if
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import check_sums, inside, read_json
@@ -59,9 +59,7 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
         if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
             raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
         for file in (step["state_file"] for step in steps if step.get("state_file")):
-            raise_if(
-                not isinstance(file, str), f"{folder / name}: state_file={brief(file)} must be the name of a file."
-            )
+            require(isinstance(file, str), f"{folder / name}: state_file={brief(file)} must be the name of a file.")
             tensors = read_safetensors(inside(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
                 yield NormStats(**{target: _quantiles(tensors, source) for target, source in _FEATURES.items()})

@@ -13,7 +13,7 @@ from einops import rearrange
 from torch import Tensor
 
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.errors import UserError, listed, raise_if
+from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import check_fit
 
@@ -86,7 +86,7 @@ def linear(path: str, *, layer: int | None = None) -> NameTable:
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Translate a foreign checkpoint into our names and layouts."""
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
-    raise_if(missing, f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
+    require(not missing, f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
     target = {}
     for name, pieces in table.items():
         try:
@@ -148,8 +148,8 @@ class Adapter:
     def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Write our tensors in the foreign names and layouts, the three lists included."""
         homeless = sorted(set(target) - set(self.table))
-        raise_if(
-            homeless,
+        require(
+            not homeless,
             f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
             "policies without adapters: convert another policy, merge the adapters first, or choose another format.",
         )
@@ -169,8 +169,8 @@ class Adapter:
         for constant in self.derived:  # what a checkpoint stores of them is what this configuration gives
             if constant.path in released:
                 stored, expected = (x.real.float().cpu() for x in (released[constant.path], constant.make()))
-                raise_if(
-                    stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
+                require(
+                    stored.shape == expected.shape and torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
                     f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
                     f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here.",
                 )

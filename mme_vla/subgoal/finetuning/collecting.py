@@ -22,7 +22,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
@@ -77,7 +77,7 @@ def build(
 ) -> dict[str, int]:
     """Build these sets; return the number of rows of each."""
     options = options or RowOptions()
-    raise_if(not episodes or not sets, "There is nothing to build: name at least one episode and one of the sets.")
+    require(episodes and sets, "There is nothing to build: name at least one episode and one of the sets.")
     names = [episode.name for episode in episodes]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
@@ -90,8 +90,8 @@ def build(
 def _build(
     episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions, plan: dict[str, Any]
 ) -> dict[str, int]:
-    raise_if(
-        not claim_plan(output, plan),
+    require(
+        claim_plan(output, plan),
         f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
         "repeat that command to finish it, or remove the folder yourself.",
     )
@@ -162,8 +162,8 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
     demonstrations = []
     for e in range(len(source)):
         task = task_names.get(str(e)) or source.task(e)
-        raise_if(
-            not task,
+        require(
+            task,
             f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
             'tasks=<file> with {"<episode index>": "<Task>", …}.',
         )

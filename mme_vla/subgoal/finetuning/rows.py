@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief, did_you_mean, raise_if
+from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.subgoal.answers import SubgoalHistory
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps, windows
@@ -73,7 +73,7 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
     Args:
         name: a key of `SETS`.
     """
-    raise_if(name not in SETS, f"sets: {name!r}. {did_you_mean(str(name), SETS)}")
+    require(name in SETS, f"sets: {name!r}. {did_you_mean(str(name), SETS)}")
     folder, kind = SETS[name]
     build = _memer if folder == "memer" else _qwenvl
     stem = f"{folder}/images/{labels.task}_ep{labels.number}"
@@ -142,10 +142,10 @@ _TIME = 12  # tokens of a video frame's time stamp, at most
 def read_rows(file: str | Path) -> list[Row]:
     """Read a JSON-lines file."""
     path = Path(file)
-    raise_if(not path.is_file(), f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
+    require(path.is_file(), f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
     Sums(path.parent, remedy="Build the training data again").check(path.name)
     rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
-    raise_if(not rows, f"{path} holds no row.")
+    require(rows, f"{path} holds no row.")
     return rows
 
 
@@ -214,7 +214,7 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         image = min(max(round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE), 4), IMAGE_TOKENS)
         self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
         self.left_out = len(rows) - len(self.rows)
-        raise_if(not self.rows, f"All rows of {file} are longer than max_length={max_length}; raise it.")
+        require(self.rows, f"All rows of {file} are longer than max_length={max_length}; raise it.")
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, missing_extra, raise_if
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.subgoal.finetuning.rows import Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
 
@@ -76,8 +76,8 @@ ZERO2 = {
 def accumulation(batch: int, per_device: int, processes: int) -> int:
     """Batches added up before a step, so that all processes together see `batch` rows."""
     together = per_device * processes
-    raise_if(
-        batch % together,
+    require(
+        not (batch % together),
         f"batch={batch} is no multiple of per_device_batch={per_device} times {processes} processes; "
         f"choose numbers that divide.",
     )

@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.models.connection import (
     Connection,
@@ -261,5 +261,5 @@ def make_api(provider: str, settings: Mapping[str, Any], where: str, usage: Usag
     Args:
         provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
     """
-    raise_if(provider not in CONNECTIONS, f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
+    require(provider in CONNECTIONS, f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
     return Api(read_section(CONNECTIONS[provider].settings_type, settings, where), usage, client, provider=provider)

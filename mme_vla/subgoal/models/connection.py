@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, Range
-from mme_vla.errors import UserError, missing_extra, raise_if
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.subgoal.clips import ENCODING, sample_video
 from mme_vla.utils.media import png_bytes, video_bytes
 
@@ -126,7 +126,7 @@ class GoogleConnection(Connection):
 
 
 def _google_client(settings: Settings) -> Any:
-    raise_if(not settings.key, f"Gemini needs a key in the environment variable {settings.key_variable}.")
+    require(settings.key, f"Gemini needs a key in the environment variable {settings.key_variable}.")
     try:
         from google import genai
     except ImportError:
@@ -177,8 +177,9 @@ class OpenAISettings(Settings):
     video_frames: Annotated[int, Range(least=2)] = 10
 
     def __post_init__(self) -> None:
-        raise_if(
-            self.video_frames % 2, f"video_frames={self.video_frames} must be an even number of images, 2 or more."
+        require(
+            not (self.video_frames % 2),
+            f"video_frames={self.video_frames} must be an even number of images, 2 or more.",
         )
         if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
             shown = self.base_url.rpartition("@")[2]  # without a password
@@ -252,8 +253,8 @@ class OpenAIConnection(Connection):
 
 
 def _openai_client(settings: OpenAISettings) -> Any:
-    raise_if(
-        settings.key_variable is not None and not settings.key,
+    require(
+        settings.key_variable is None or settings.key,
         f"{settings.model} needs a key in the environment variable {settings.key_variable}; an endpoint that asks "
         "for none has key_variable=null.",
     )
