@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
-from mme_vla.errors import UserError, require, require_choice
+from mme_vla.errors import UserError, raise_if, require_choice
 from mme_vla.utils import parse_json, to_line, verified
 
 Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
@@ -140,15 +140,15 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
         if old is None or (old.outcome == "error" and new.outcome != "error"):
             merged[at] = new
             continue
-        require(
-            new.seed == old.seed,
+        raise_if(
+            new.seed != old.seed,
             f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
             "these are not the same benchmark; evaluate both from the same episode metadata.",
         )
         if new.outcome in (old.outcome, "error"):
             continue
-        require(
-            conflicts != "refuse",
+        raise_if(
+            conflicts == "refuse",
             f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
             f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last.",
         )
