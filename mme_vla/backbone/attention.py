@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import check_choice, require
 
 Visibility = Mapping[str, frozenset[str] | set[str]]
 """For each block of queries: the blocks whose keys it may attend to."""
@@ -54,8 +54,7 @@ class Span(NamedTuple):
 
 def visible_blocks(name: str, table: Visibility) -> frozenset[str] | set[str]:
     """The blocks that a block of this name attends to."""
-    if name not in table:
-        raise UserError(f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.")
+    require(name in table, f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.")
     return table[name]
 
 
@@ -203,8 +202,7 @@ def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
 
 def check_backend(name: str) -> str:
     """The name of a backend."""
-    if name not in BACKENDS:
-        raise UserError(f"policy.attention={name!r}. {did_you_mean(str(name), BACKENDS)}")
+    check_choice("policy.attention", name, BACKENDS)
     return name
 
 

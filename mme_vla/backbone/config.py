@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from mme_vla.backbone.base import Backbone
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
 
 LARGEST, DEEPEST = 2**24, 2**10
@@ -21,12 +21,11 @@ LARGEST, DEEPEST = 2**24, 2**10
 def check_positive(config: Any, prefix: str) -> None:
     """Raise an error if a number of a dataclass is not a possible size."""
     for name, value in vars(config).items():
-        if isinstance(value, float) and not 0 < value < 1:
-            raise UserError(f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
-        if isinstance(value, int) and not isinstance(value, bool) and value < 1:
-            raise UserError(f"{prefix}{name}={brief(value)} must be at least 1.")
-        if isinstance(value, int) and value > (DEEPEST if name in ("depth", "horizon") else LARGEST):
-            raise UserError(f"{prefix}{name}={brief(value)} is larger than any network can be.")
+        if isinstance(value, float):
+            require(0 < value < 1, f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
+        if isinstance(value, int) and not isinstance(value, bool):
+            most = DEEPEST if name in ("depth", "horizon") else LARGEST
+            require(1 <= value <= most, f"{prefix}{name}={brief(value)} must be at least 1 and at most {most}.")
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,7 @@ class VisionConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "vision.")
-        if self.image_size % self.patch_size:
-            raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
+        check_multiple("vision.", "image_size", self.image_size, "patch_size", self.patch_size)
 
 
 @dataclass(frozen=True)
@@ -76,14 +74,10 @@ class BackboneConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
-        if self.num_heads % self.num_kv_heads:
-            raise UserError(f"num_heads={self.num_heads} must be a multiple of num_kv_heads={self.num_kv_heads}.")
-        if self.head_dim % 2:
-            raise UserError(f"head_dim={self.head_dim} must be even: rotary embedding turns pairs.")
-        if self.action.width % 2:
-            raise UserError(f"action.width={self.action.width} must be even: the flow time is embedded in sin and cos.")
-        if self.time_distribution not in ("beta", "uniform"):
-            raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
+        check_multiple("backbone.", "num_heads", self.num_heads, "num_kv_heads", self.num_kv_heads)
+        check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)  # of a rotation
+        check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)  # sin and cos of the flow time
+        check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))
 
 
 _INITIALISERS = {Tensor.normal_, Tensor.uniform_}

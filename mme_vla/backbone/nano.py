@@ -19,7 +19,7 @@ from mme_vla.backbone.flow import HasFlowHead, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.errors import UserError
+from mme_vla.errors import check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recomputes
 from mme_vla.speed.recompute import Recompute
@@ -44,11 +44,11 @@ class TowerConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "vision.")
-        if self.image_size % 16:
-            raise UserError(f"vision.image_size={self.image_size} must be a multiple of 16.")
+        check_multiple("vision.", "image_size", self.image_size, "stride", 16)
         for width in (self.width_32, self.width_16, self.width_8):
-            if width % 8:
-                raise UserError(f"vision: {width} channels cannot be normalised in 8 groups; take a multiple of 8.")
+            require(
+                not (width % 8), f"vision: {width} channels cannot be normalised in 8 groups; take a multiple of 8."
+            )
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,9 @@ class NanoConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
-        if self.action.width % 2 or self.head_dim % 2:
-            raise UserError("backbone.action.width and backbone.head_dim must be even.")
-        if self.time_distribution not in ("beta", "uniform"):
-            raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
+        check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)
+        check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)
+        check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))
 
 
 MAX_VIEWS, MAX_WORDS = 4, 256

@@ -12,7 +12,7 @@ from torch.nn import functional
 from mme_vla.backbone.attention import fused_kernels
 from mme_vla.backbone.config import VisionConfig
 from mme_vla.backbone.layers import compute_dtype
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 PERIOD = 10_000.0
 
@@ -130,8 +130,9 @@ def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
         pooling: `mean` as released, or `max` (paper, section 4.2).
     """
     side = int(tokens.shape[-2] ** 0.5)
-    if side % grid:
-        raise UserError(f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}.")
+    require(
+        not (side % grid), f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}."
+    )
     window = side // grid
     cells = tokens.unflatten(-2, (grid, window, grid, window))
     if pooling == "mean":

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from mme_vla.backbone.attention import Block, Visibility
 from mme_vla.backbone.config import BackboneConfig
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.integration.base import (
     MEMORY_VISIBILITY,
     Integration,
@@ -44,17 +44,17 @@ class Context(Integration):
                 states do.
         """
         super().__init__(backbone)
-        if not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False):
-            raise UserError(
-                "integration.prompt_sees_memory=false hides memory from the prompt, but in this backbone every token "
-                "sees every other: leave it true."
-            )
+        require(
+            not (not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False)),
+            "integration.prompt_sees_memory=false hides memory from the prompt, but in this backbone every token "
+            "sees every other: leave it true.",
+        )
         self.memory_width, self.memory_position = backbone.vlm.width, checked_position(memory_position)
-        if mutual and (memory_position == "time" or not prompt_sees_memory):
-            raise UserError(
-                "integration.mutual=true puts memory between images and prompt, where all see each other: that goes "
-                "with memory_position=slot and prompt_sees_memory=true alone."
-            )
+        require(
+            not (mutual and (memory_position == "time" or not prompt_sees_memory)),
+            "integration.mutual=true puts memory between images and prompt, where all see each other: that goes "
+            "with memory_position=slot and prompt_sees_memory=true alone.",
+        )
         self.mutual = mutual
         self.visibility = MUTUAL if mutual else memory_visibility(prompt_sees_memory)
 

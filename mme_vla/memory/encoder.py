@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.history import StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -24,8 +24,9 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
         [..., dim] float32, computed where the positions are.
     """
     w = dim // 6
-    if dim % 6 or w < 2:
-        raise UserError(f"position_dim={dim} must be a multiple of 6 and at least 12: three axes, sin and cos.")
+    require(
+        dim % 6 == 0 and w >= 2, f"position_dim={dim} must be a multiple of 6 (three axes, sin and cos) from 12 on."
+    )
     ramp = torch.arange(w, device=positions.device, dtype=torch.float32) / (w - 1)
     frequencies = torch.stack([TEMPORAL_BASE**-ramp, SPATIAL_BASE**-ramp, SPATIAL_BASE**-ramp])  # 3 w
     angles = positions.float()[..., None] * frequencies
@@ -46,8 +47,7 @@ class FeatureEncoder(nn.Module):
     def __init__(self, d_vision: int, width: int, position_dim: int | None = None, position_hidden: int | None = None):
         super().__init__()
         for name, size in (("position_dim", position_dim), ("position_hidden", position_hidden)):
-            if size is not None and size < 1:
-                raise UserError(f"memory.{name}={size}: must be at least 1, or null for its default.")
+            require(size is None or size >= 1, f"memory.{name}={size}: must be at least 1, or null for its default.")
         self.position_dim = default_position_dim(d_vision) if position_dim is None else position_dim
         hidden = self.position_dim if position_hidden is None else position_hidden
         self.position = nn.Linear(self.position_dim, hidden)

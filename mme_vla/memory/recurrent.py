@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla.config.devices import float32_products
-from mme_vla.errors import UserError
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import (
     CompilableMemory,
     MatmulPrecision,
@@ -161,14 +161,8 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
         """
         super().__init__()
-        sizes = {"max_steps": max_steps, "max_video": max_video, "stride": stride, "chunk": chunk}
-        for key, value in sizes.items():
-            if value < 1:
-                raise UserError(f"memory.{key}={value} must be at least 1.")
-        if not 0 <= 2 * jitter < stride:
-            raise UserError(
-                f"memory.jitter={jitter} must be less than half of memory.stride={stride}: frames keep order."
-            )
+        check_sizes("memory", max_steps=max_steps, max_video=max_video, stride=stride, chunk=chunk)
+        require(0 <= 2 * jitter < stride, f"memory.jitter={jitter} must be less than half of memory.stride={stride}.")
         self.budget, self.capacity = budget, max_steps * grid**2
         self.storage = StorageSpec(grid, pooling)
         self.max_steps, self.max_video, self.stride = max_steps, max_video, stride

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import ScoringMemory
 from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
@@ -33,8 +33,8 @@ class ChangeScorer(FrameScorer):
         if frame_index and (frame_index + 1) % self.stride:
             return None
         height, width, _ = frame.shape
-        if height % self.grid or width % self.grid:
-            raise UserError(f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches.")
+        divides = height % self.grid == width % self.grid == 0
+        require(divides, f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches.")
         image = frame.astype(np.float32) / 255 * 2 - 1
         reference, self._reference = self._reference, image
         if reference is None or frame_index == 0:
@@ -72,13 +72,12 @@ class TokenDrop(PerceptualMemory, ScoringMemory):
             causal: only frames up to the current one compete for that list. False lets the whole episode compete,
                 as the released offline preprocessing does; it needs a finished episode.
         """
-        if stride < 1:
-            raise UserError(f"memory.stride={stride} must be at least 1: the frames between two that are scored.")
-        if not grid**2 <= budget <= candidates:
-            raise UserError(
-                f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
-                f"memory.candidates={candidates} (the patches a running list holds)."
-            )
+        check_sizes("memory", stride=stride)
+        require(
+            grid**2 <= budget <= candidates,
+            f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
+            f"memory.candidates={candidates} (the patches a running list holds).",
+        )
         storage = StorageSpec(grid, pooling, keep_every=stride, scorer=ChangeScorer(grid, stride).key)
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.stride, self.candidates, self.causal = stride, candidates, causal

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.normalise import finite_array
 from mme_vla.speed.rtc import overlap_weights
@@ -25,14 +25,15 @@ class ActionPrefix:
 def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) -> ActionPrefix:
     """A prefix of a chunk of `horizon` actions of `width` numbers."""
     values = finite_array(actions, "the actions of the prefix")
-    if values.ndim != 2 or values.shape[1] != width or not 1 <= len(values) <= horizon:
-        raise UserError(
-            f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape {values.shape}."
-        )
-    if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay <= len(values):
-        raise UserError(
-            f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the actions given."
-        )
+    require(
+        values.ndim == 2 and values.shape[1] == width and 1 <= len(values) <= horizon,
+        f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape {values.shape}.",
+    )
+    right = isinstance(delay, int) and not isinstance(delay, bool) and 0 <= delay <= len(values)
+    require(
+        right,
+        f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the actions given.",
+    )
     return ActionPrefix(values, delay)
 
 

@@ -181,10 +181,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     def recompute(self, mode: Recompute) -> None:
         if not isinstance(self.backbone, Recomputes):
-            raise UserError(
-                f"train.recompute: {type(self.backbone).__name__} does not inherit from `Recomputes` "
-                "(mme_vla.speed). Set train.recompute=false."
-            )
+            name = type(self.backbone).__name__
+            raise UserError(f"train.recompute: {name} does not inherit from mme_vla.speed.Recomputes. Set it to false.")
         self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
@@ -254,10 +252,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             UserError: this backbone has no sampler that can be captured.
         """
         if not isinstance(self.backbone, CapturableSampling):
-            raise UserError(
-                f"The backbone {type(self.backbone).__name__} has no sampler that can be compiled: leave "
-                "sampling=eager."
-            )
+            name = type(self.backbone).__name__
+            raise UserError(f"The backbone {name} has no sampler that can be compiled: leave sampling=eager.")
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)

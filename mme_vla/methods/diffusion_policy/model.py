@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.pi05 import initialise
 from mme_vla.backbone.siglip import VisionTower, pool_grid
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import missing_extra, require
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.speed.recompute import Recompute, run_layer
 
@@ -76,8 +76,7 @@ def sample(
         fresh: [b, steps − 1, h, a], what is added after each step but the last. steps: fewer than the schedule's.
     """
     total = int(schedule.config.num_train_timesteps)
-    if steps is not None and not 1 <= steps <= total:
-        raise UserError(f"flow_steps={steps}: Diffusion Policy samples in 1 to {total} steps.")
+    require(steps is None or 0 < steps <= total, f"flow_steps={steps}: Diffusion Policy samples in 1 to {total} steps.")
     schedule.set_timesteps(steps or total)
     x = start
     for i, step in enumerate(schedule.timesteps.tolist()):
