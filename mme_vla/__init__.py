@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from mme_vla.errors import UserError
     from mme_vla.evaluation.api import evaluate
     from mme_vla.integration.base import Integration
-    from mme_vla.memory.base import Memory
-    from mme_vla.memory.encoder import PerceptualMemory
+    from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
     from mme_vla.memory.recurrent import RecurrentMemory
     from mme_vla.policy.base import Policy
@@ -40,7 +39,7 @@ _HOME = {
     "MMEPolicy": "mme_vla.policy.mme",
     "Episode": "mme_vla.policy.episode",
     "Memory": "mme_vla.memory.base",
-    "PerceptualMemory": "mme_vla.memory.encoder",
+    "PerceptualMemory": "mme_vla.memory.base",
     "RecurrentMemory": "mme_vla.memory.recurrent",
     "StorageSpec": "mme_vla.memory.history",
     "History": "mme_vla.memory.history",

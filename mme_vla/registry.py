@@ -100,7 +100,9 @@ MEMORIES: Registry[Any] = Registry(
     },
 )
 INTEGRATIONS: Registry[Any] = Registry(
-    "integration", {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "expert", "film")}
+    "integration",
+    {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "film")}
+    | {"expert": "mme_vla.integration.context"},
 )
 BACKBONES: Registry[Any] = Registry(
     "backbone",

@@ -12,17 +12,15 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import Block, additive_mask, attend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hook, Injection, bind_hook
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.flow import HasFlowHead, time_embedding
-from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm
+from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import initialise
 from mme_vla.errors import check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import Recomputes
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch, Noise, map_noise
 
 

@@ -5,9 +5,9 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import PI05_VISIBILITY, Block, Visibility
 from mme_vla.backbone.base import Hook, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.layers import PI05_VISIBILITY, Block, Visibility
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.types import MemoryTokens
 

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import require
-from mme_vla.memory.base import all_patches, union_frames
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import ScoringMemory
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.base import PerceptualMemory, ScoringMemory
 from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 

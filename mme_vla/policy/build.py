@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.backbone.config import shapes_only
+from mme_vla.backbone.building import shapes_only
 from mme_vla.config.naming import words
 from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.errors import UserError, require

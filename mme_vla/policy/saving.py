@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.config import shapes_only
+from mme_vla.backbone.building import shapes_only
 from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
 from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT

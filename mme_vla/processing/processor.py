@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.config import shape_of
+from mme_vla.backbone.building import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, check_whole, did_you_mean, listed, require

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
-from mme_vla.speed.recompute import ALL, SELECTIVE, Recompute
+from mme_vla.speed import ALL, SELECTIVE, Recompute
 from mme_vla.training.parallel import ParallelSettings
 
 SCHEDULES = ("constant", "cosine", "steps")

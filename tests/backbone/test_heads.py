@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError, register
-from mme_vla.backbone.attention import PI05_VISIBILITY
 from mme_vla.backbone.base import Injection
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig, read_backbone
+from mme_vla.backbone.building import read_backbone
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.backbone.flow import FlowHead
+from mme_vla.backbone.layers import PI05_VISIBILITY
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.types import Batch
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
 from mme_vla.backbone import attention, gemma
-from mme_vla.backbone.attention import (
+from mme_vla.backbone.layers import (
     ALIGNMENT,
     BIG_NEGATIVE,
     PI05_VISIBILITY,

@@ -10,8 +10,8 @@ from helpers.recurrent_memories import MEMORIES, RandomHistory, same_memory, sma
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.serving_fakes import Served, acted_directly, course, observation, wait_until
 from mme_vla.envs.vector.pool import Job
-from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.joined import JoinedMemory
+from mme_vla.memory.recurrent import recurrent_frames
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.testing.small import moving_frames
 

@@ -17,7 +17,8 @@ from helpers.recurrent_memories import (
     window,
 )
 from mme_vla import UserError, build_policy
-from mme_vla.memory.base import jittered, recurrent_frames, stack_history
+from mme_vla.memory.base import stack_history
+from mme_vla.memory.recurrent import jittered, recurrent_frames
 from mme_vla.memory.ttt import TTT
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 from mme_vla.types import HistoryTokens

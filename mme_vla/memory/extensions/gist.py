@@ -14,12 +14,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import recurrent_frames
-from mme_vla.memory.encoder import FeatureEncoder
+from mme_vla.memory.base import FeatureEncoder
 from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden
+from mme_vla.memory.recurrent import default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 

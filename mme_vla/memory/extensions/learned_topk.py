@@ -17,8 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import require
-from mme_vla.memory.base import MemoryModule, all_patches, union_frames
-from mme_vla.memory.encoder import FeatureEncoder, position_features
+from mme_vla.memory.base import FeatureEncoder, MemoryModule, all_patches, position_features, union_frames
 from mme_vla.memory.extensions.attending import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
-from mme_vla.memory.base import all_patches
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.base import PerceptualMemory, all_patches
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES

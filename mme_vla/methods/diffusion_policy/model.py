@@ -14,7 +14,7 @@ from mme_vla.backbone.pi05 import initialise
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.errors import missing_extra, require
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
-from mme_vla.speed.recompute import Recompute, run_layer
+from mme_vla.speed import Recompute, run_layer
 
 if TYPE_CHECKING:
     from torch.nn import GroupNorm

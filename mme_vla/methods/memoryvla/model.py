@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import additive_mask
+from mme_vla.backbone.layers import additive_mask
 from mme_vla.errors import require
 from mme_vla.integration.base import required
 from mme_vla.memory.extensions.bank import BankState, MemoryBank, Retrieval

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.config import shapes_only
+from mme_vla.backbone.building import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, require
@@ -27,7 +27,7 @@ from mme_vla.policy.saving import policy_options
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 

@@ -22,7 +22,7 @@ from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import NetworkPolicy, own_processor
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import POLICIES
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import Noise, map_noise
 
