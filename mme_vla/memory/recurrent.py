@@ -177,6 +177,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         budget: int,
         grid: int = 8,
         pooling: str = "mean",
+        *,
         max_steps: int = 64,
         max_video: int = 40,
         stride: int = 16,

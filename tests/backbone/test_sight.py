@@ -33,11 +33,6 @@ def test_what_a_valid_token_sees_is_what_the_table_says(table: Visibility) -> No
     assert sum(layout.lengths) == valid.shape[1] and len(layout.lengths) <= len(spans)
 
 
-def test_neighbours_that_see_the_same_are_one_run() -> None:
-    spans = blocks_of(PI05_VISIBILITY)
-    assert MaskLayout.of(spans, spans, validity(18), PI05_VISIBILITY).lengths == (12, 6)
-
-
 def test_a_subset_of_the_queries_has_the_mask_rows_of_all_queries() -> None:
     spans = blocks_of(MEMORY_VISIBILITY)
     layout = MaskLayout.of(spans, spans, validity(22), MEMORY_VISIBILITY)

@@ -33,6 +33,7 @@ class Banked(FrameMemory):
         budget: int = 64,
         grid: int = 8,
         pooling: str = "mean",
+        *,
         stride: int = 16,
         moments: int = 32,
         video: int = 16,

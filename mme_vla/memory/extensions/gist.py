@@ -35,6 +35,7 @@ class Gist(FrameMemory):
         d_vision: int,
         width: int,
         budget: int = 512,
+        *,
         anchors: int = 2,
         recent: int = 4,
         gists: int = 8,

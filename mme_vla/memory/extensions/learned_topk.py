@@ -40,6 +40,7 @@ class LearnedTopK(MemoryModule):
         d_vision: int,
         width: int,
         budget: int = 256,
+        *,
         pool: int = 64,
         grid: int = 4,
         pooling: str = "mean",
