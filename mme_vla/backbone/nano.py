@@ -18,7 +18,7 @@ from mme_vla.backbone.flow import HasFlowHead, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.errors import check_choice, check_multiple, require
+from mme_vla.errors import check_choice, check_multiple
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch, Noise, map_noise
@@ -43,10 +43,8 @@ class TowerConfig:
     def __post_init__(self) -> None:
         check_positive(self, "vision.")
         check_multiple("vision.", "image_size", self.image_size, "stride", 16)
-        for width in (self.width_32, self.width_16, self.width_8):
-            require(
-                not (width % 8), f"vision: {width} channels cannot be normalised in 8 groups; take a multiple of 8."
-            )
+        for name in ("width_32", "width_16", "width_8"):
+            check_multiple("vision.", name, getattr(self, name), "groups", 8)
 
 
 @dataclass(frozen=True)

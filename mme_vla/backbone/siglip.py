@@ -75,7 +75,7 @@ def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
     """
     side = int(tokens.shape[-2] ** 0.5)
     require(
-        not (side % grid), f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}."
+        side % grid == 0, f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}."
     )
     window = side // grid
     cells = tokens.unflatten(-2, (grid, window, grid, window))

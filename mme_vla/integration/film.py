@@ -11,7 +11,7 @@ from mme_vla.types import MemoryTokens
 
 
 class PooledIntegration(Integration):
-    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one says it hosts `vector`."""
+    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one supports `vector`."""
 
     required_features = frozenset({"vector"})
     feature_width: int

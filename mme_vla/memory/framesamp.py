@@ -36,7 +36,7 @@ class FrameSamp(PerceptualMemory):
             every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor encoded. 1: all.
         """
         require(
-            not (budget % grid**2) and budget >= grid**2,
+            budget % grid**2 == 0 and budget >= grid**2,
             f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
             f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}.",
         )

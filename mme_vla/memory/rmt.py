@@ -49,7 +49,7 @@ class RMTLayer(RecurrentLayer):
     ) -> None:
         super().__init__()
         require(
-            not (hidden % (2 * heads)) and not (heads % kv_heads),
+            hidden % (2 * heads) == 0 and heads % kv_heads == 0,
             f"memory.hidden={hidden}, memory.heads={heads}, memory.kv_heads={kv_heads} do not fit: hidden must be "
             "an even multiple of heads, and heads a multiple of kv_heads.",
         )

@@ -56,7 +56,7 @@ class TTTLayer(RecurrentLayer):
         max_grad_norm: float,
     ) -> None:
         super().__init__()
-        require(not (hidden % heads), f"memory.hidden={hidden} must be a multiple of memory.heads={heads}.")
+        require(hidden % heads == 0, f"memory.hidden={hidden} must be a multiple of memory.heads={heads}.")
         positive = min(base_rate, max_rate, max_grad_norm) > 0
         require(positive, "memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0.")
         width = hidden // heads

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
-from mme_vla.backbone import attention, gemma
+from mme_vla.backbone import gemma, layers
 from mme_vla.backbone.layers import (
     ALIGNMENT,
     BIG_NEGATIVE,
@@ -89,7 +89,7 @@ def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
         return MaskLayout((1,) * asking.shape[1], attention_mask(spans, keys, asking, valid, table))
 
     monkeypatch.setattr(gemma.MaskLayout, "of", as_it_was)
-    monkeypatch.setattr(attention, "BIG_NEGATIVE", -2.3819763e38)
+    monkeypatch.setattr(layers, "BIG_NEGATIVE", -2.3819763e38)
     before = results()
     assert torch.equal(now[0], before[0]) and torch.equal(now[2], before[2])
     assert now[1].keys() == before[1].keys()

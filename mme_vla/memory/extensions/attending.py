@@ -19,7 +19,7 @@ MLP = 4
 def heads_of(hidden: int, heads: int | None) -> int:
     """So many heads; None is one for each 64 of `hidden`, at least 2."""
     heads = heads or max(2, hidden // 64)
-    require(heads >= 1 and not (hidden % heads), f"memory.heads={heads} does not divide memory.hidden={hidden}.")
+    require(heads >= 1 and hidden % heads == 0, f"memory.heads={heads} does not divide memory.hidden={hidden}.")
     return heads
 
 

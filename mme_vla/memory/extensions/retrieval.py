@@ -47,7 +47,7 @@ class Retrieval(PerceptualMemory):
             longest: most stored frames of a chunk.
         """
         require(
-            not (budget % grid**2) and budget >= grid**2,
+            budget % grid**2 == 0 and budget >= grid**2,
             f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
             f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}.",
         )

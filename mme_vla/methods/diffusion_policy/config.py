@@ -58,7 +58,7 @@ class DiffusionSizes:
         require(0 < self.crop <= 1, f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
         halved = 2 ** (len(self.widths) - 1)
         require(
-            not (self.horizon % halved),
+            self.horizon % halved == 0,
             f"embodiment.action.horizon={self.horizon} must be a multiple of {halved}: each of the U-Net's "
             f"{len(self.widths)} levels (backbone.widths) but the last halves the chunk.",
         )

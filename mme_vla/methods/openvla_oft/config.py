@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from mme_vla.backbone.config import check_positive
-from mme_vla.errors import UserError, check_multiple, check_sizes, require
+from mme_vla.errors import check_multiple, check_sizes, require
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,9 @@ class OpenVlaConfig:
     horizon: int = 20
 
     def __post_init__(self) -> None:
-        for name in ("vocab_size", "end_id", "action_dim", "horizon"):
-            if getattr(self, name) < 1:
-                raise UserError(f"backbone.{name}={getattr(self, name)} must be at least 1.")
+        check_sizes(
+            "backbone", **{name: getattr(self, name) for name in ("vocab_size", "end_id", "action_dim", "horizon")}
+        )
         require(self.state_dim >= 0, f"backbone.state_dim={self.state_dim} must be at least 0.")
         require(
             self.end_id < self.vocab_size, f"backbone.end_id={self.end_id} is no token of vocab_size={self.vocab_size}."

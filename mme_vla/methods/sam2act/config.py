@@ -86,9 +86,7 @@ class SAM2ActSizes:
     def __post_init__(self) -> None:
         _check_sizes(self, "backbone")
         check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)
-        require(
-            not (self.depth % 2), f"backbone.depth={self.depth} must be even: half of the layers see one view alone."
-        )
+        check_multiple("backbone.", "depth", self.depth, "pairs", 2)  # half of the layers see one view alone
         for name in ("token", "memory"):
             check_multiple("backbone.encoder.", name, getattr(self, name), "quarters", 4)
         require(360 % self.rotation_bins == 0, f"backbone.rotation_bins={self.rotation_bins} must divide 360 degrees.")

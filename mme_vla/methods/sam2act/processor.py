@@ -226,6 +226,7 @@ class SAM2ActProcessor(PolicyProcessor):
         language: int = 512,
         words: int = 77,
         side: int = 128,
+        *,
         bounds: Sequence[float] = (-1, -1, -1, 1, 1, 1),
         trained_waypoints: int = 25,
         waypoints: int = 40,
@@ -243,8 +244,8 @@ class SAM2ActProcessor(PolicyProcessor):
             video_frames: frames of the conditioning video that are encoded, evenly spaced.
             field_of_view: of all cameras, in degrees; the benchmark's have 90.
         """
-        sizes = {"language": language, "words": words, "side": side, "trained_waypoints": trained_waypoints,
-                 "waypoints": waypoints, "video_frames": video_frames}  # fmt: skip
+        sizes = {"language": language, "words": words, "side": side, "video_frames": video_frames}
+        sizes |= {"trained_waypoints": trained_waypoints, "waypoints": waypoints}
         for name, value in sizes.items():
             check_whole(f"processor.{name}", value, LARGEST)
         numbers = list(bounds)
