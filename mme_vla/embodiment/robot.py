@@ -114,9 +114,10 @@ class Embodiment:
 
     def to_dict(self) -> dict[str, Any]:
         """The section that `from_dict` reads, fit for JSON."""
+        depth = {True: {"depth": True}, False: {}}  # absent in files of earlier versions
         return {
             "name": self.name,
-            "cameras": {camera.name: _described(camera) for camera in self.cameras},
+            "cameras": {c.name: {"key": c.key, "augment": c.augment, **depth[c.depth]} for c in self.cameras},
             "memory_camera": self.memory_camera,
             "state": {"key": list(self.state.key), "width": self.state.width},
             "action": self.action.to_dict(),
@@ -145,11 +146,6 @@ class Embodiment:
             f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are the same length "
             "of a chunk: set the embodiment's, which the backbone follows.",
         )
-
-
-def _described(camera: Camera) -> dict[str, Any]:
-    depth = {"depth": True} if camera.depth else {}  # absent in files of earlier versions
-    return {"key": camera.key, "augment": camera.augment, **depth}
 
 
 def _cameras(section: Any) -> tuple[Camera, ...]:

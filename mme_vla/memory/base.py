@@ -328,13 +328,10 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
     return torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
 
-def default_position_dim(d_vision: int) -> int:
-    """3/8 of the vision width in multiples of 6, at least 48: 768 at full size, as released."""
-    return max(48, 6 * (d_vision // 16))
-
-
 class FeatureEncoder(nn.Module):
     """token = W₂ [feature | SiLU(W₁ position)]: nothing before, between or after, as released.
+
+    Positions are `position_dim` wide: by default 3/8 of the vision width in multiples of 6, 768 at full size.
 
     Padding (zero feature, zero position) becomes the constant W₂ [0 | SiLU(b₁)]: only the mask tells it apart.
     """
@@ -343,7 +340,7 @@ class FeatureEncoder(nn.Module):
         super().__init__()
         for name, size in (("position_dim", position_dim), ("position_hidden", position_hidden)):
             require(size is None or size >= 1, f"memory.{name}={size}: must be at least 1, or null for its default.")
-        self.position_dim = default_position_dim(d_vision) if position_dim is None else position_dim
+        self.position_dim = max(48, 6 * (d_vision // 16)) if position_dim is None else position_dim
         hidden = self.position_dim if position_hidden is None else position_hidden
         self.position = nn.Linear(self.position_dim, hidden)
         self.project = nn.Linear(d_vision + hidden, width)

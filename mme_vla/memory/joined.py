@@ -56,7 +56,9 @@ class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, 
         sections = shares(members, budget)
         built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
         self.members = nn.ModuleList(built)
-        self.names = _distinct([section["name"] for section in sections])
+        names = [section["name"] for section in sections]
+        # Equal names get a number.
+        self.names = [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]
         self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
@@ -278,8 +280,3 @@ def _padded(part: HistoryTokens, member: MemoryModule) -> HistoryTokens:
     pad = nn.functional.pad
     features, positions = pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends))
     return HistoryTokens(features, positions, pad(part.mask, ends), part.step)
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, with a number behind those that came before."""
-    return [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]

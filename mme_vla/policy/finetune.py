@@ -139,7 +139,7 @@ def add_adapters(
     seed: int = 42,
 ) -> None:
     """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
-    adapted = policy.config.get("adapters") and _has_adapters(policy)
+    adapted = policy.config.get("adapters") and any(".lora_" in name for name, _ in policy.named_parameters())
     require(not adapted, "This policy has adapters already: merge_adapters() first.")
     require(
         rank >= 1 and alpha > 0 and 0 <= dropout < 1,
@@ -192,10 +192,6 @@ def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | Non
         reason = brief(str(error), 200, quote=False)
         raise UserError(f"A checkpoint's adapters {brief(adapters)} do not fit its weights ({reason}).") from error
     return merged
-
-
-def _has_adapters(policy: "Policy") -> bool:
-    return any(".lora_" in name for name, _ in policy.named_parameters())
 
 
 def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:

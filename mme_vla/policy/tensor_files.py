@@ -54,8 +54,9 @@ def weight_files(folder: Path) -> list[Path]:
     if (folder / INDEX).is_file():
         check_sums(folder, [INDEX])
         table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
-        names = set(table.values()) if isinstance(table, dict) and _all_texts(table) else set()
-        require(names, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
+        names = set(table.values()) if isinstance(table, dict) else set()
+        texts = names and all(isinstance(name, str) for name in names)
+        require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
         return [inside(folder, name, "weights") for name in sorted(names)]
     if (folder / WEIGHTS).is_file():
         return [inside(folder, WEIGHTS, "weights")]
@@ -186,10 +187,6 @@ def replace_folder(built: Path, target: Path) -> None:
         target.rename(old)
     built.rename(target)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _all_texts(table: Mapping[str, object]) -> bool:
-    return all(isinstance(name, str) for name in table.values())
 
 
 def _kind(tensor: Tensor) -> str:

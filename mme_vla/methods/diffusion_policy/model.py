@@ -134,11 +134,6 @@ class SpatialSoftmax(nn.Module):
         return weights @ cell_centres(height, width, maps.device).to(weights)
 
 
-def keypoint_pool(keypoints: int) -> nn.Sequential:
-    """Maps → [n, 2·keypoints]: x0, y0, x1, … As trained, a ReLU follows: what lies left or above has a 0 there."""
-    return nn.Sequential(SpatialSoftmax(CHANNELS, keypoints), nn.Flatten(), nn.ReLU())
-
-
 FINAL_GROUPS = 8
 """Groups of the last block's norm, whatever the others have (as trained)."""
 
@@ -271,7 +266,8 @@ class DiffusionNetwork(nn.Module):
             self.vision = VisionTower(sizes.memory_tower, sizes.memory_width)
             initialise(self.vision)
         self.image_encoder = build_image_encoder()
-        self.image_pool = keypoint_pool(sizes.keypoints)
+        # Keypoints x0, y0, x1, … As trained, a ReLU follows: what lies left or above has a 0 there.
+        self.image_pool = nn.Sequential(SpatialSoftmax(CHANNELS, sizes.keypoints), nn.Flatten(), nn.ReLU())
         self.text_proj = nn.Sequential(
             nn.LayerNorm(sizes.text_dim),
             nn.Linear(sizes.text_dim, sizes.text_hidden),

@@ -88,13 +88,6 @@ def text_features(tower: "CLIPTextModelWithProjection", ids: Tensor, mask: Tenso
     return functional.normalize(tower(input_ids=ids, attention_mask=mask).text_embeds, dim=-1)
 
 
-def text_encoder(name: str, width: int) -> GoalEncoder:
-    """The encoder called `hashed` or `clip`, or a CLIP in a folder of one's own."""
-    if name == HASHED:
-        return HashedWords(width)
-    return ClipText(width, CLIP if name == "clip" else name)
-
-
 FRAMES = ("consecutive", "asked")
 CLIP_NAME = "clip"
 BY = "extremes"
@@ -150,7 +143,9 @@ class DiffusionProcessor(PolicyProcessor):
         height, width = picture
         self.picture = (check_whole("processor.picture", height), check_whole("processor.picture", width))
         self.embodiment = embodiment
-        self.text_name, self.text = text, text_encoder(text, check_whole("processor.text_dim", text_dim))
+        width = check_whole("processor.text_dim", text_dim)
+        folder = CLIP if text == CLIP_NAME else text
+        self.text_name, self.text = text, HashedWords(width) if text == HASHED else ClipText(width, folder)
         self.samples = SampleSpec(window=window, consecutive=frames == FRAMES[0])
         self.memory_size = check_whole("processor.memory_size", memory_size)
         self.stats = stats

@@ -187,11 +187,6 @@ class ClipTokens(GoalTokens):
         return states[0]
 
 
-def goal_tokens(name: str, width: int, words: int) -> GoalTokens:
-    """The encoder called `hashed`, or a CLIP in a folder."""
-    return HashedTokens(width, words) if name == HASHED else ClipTokens(width, words, name)
-
-
 NAME = "sam2act_plus"
 FINGER_OPEN, FINGER_COUNTS_OPEN = 0.04, 0.035
 """Metres that a finger is out when open, and from which on it counts as open, as released."""
@@ -266,7 +261,8 @@ class SAM2ActProcessor(PolicyProcessor):
                 f"SAM2Act+ needs depth of every camera; the robot {embodiment.name!r} gives none of {', '.join(blind)} "
                 "(embodiment.cameras.<name>.depth). Set embodiment=robomme_keyframes."
             )
-        self.embodiment, self.text_name, self.text = embodiment, text, goal_tokens(text, language, words)
+        self.embodiment, self.text_name = embodiment, text
+        self.text = HashedTokens(language, words) if text == HASHED else ClipTokens(language, words, text)
         self.side, self.cube = side, Cube.of(numbers)
         self.trained_waypoints, self.waypoints, self.video_frames = trained_waypoints, waypoints, video_frames
         self.field_of_view = float(field_of_view)
