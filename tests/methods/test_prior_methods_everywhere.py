@@ -116,7 +116,7 @@ def make_depth_env(task: str, split: str, episode: int, max_steps: int, **option
 RESUMED = {
     **{model: (model, []) for model in ("diffusion_policy", "openvla_oft", "memoryvla", "sam2act_plus")},
     "decaying rates": ("diffusion_policy", ["train.schedule=cosine", "train.schedule_steps=3", "train.ema_warmup=true",
-                                            "train.warmup_from_zero=true", "train.decay_min_dim=2"]),
+                                            "train.warmup_from_zero=true", "train.warmup=1", "train.decay_min_dim=2"]),
     "adapters": ("openvla_oft", ["finetune=oft", "finetune.rank=2"]),
     "another optimizer": ("sam2act_plus", ["train.optimizer=lamb"]),
     "a memory of frames": ("memoryvla", ["memory=framesamp", "memory.every=8", "processor.group_size=1"]),

@@ -292,7 +292,7 @@ def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
 )  # fmt: skip
 def test_options_of_a_memory_that_cannot_be_are_refused(memory, options, message):
     with pytest.raises(UserError, match=message):
-        build_policy("pi05", memory={"name": memory, **options}, integration="modulator", device="meta")
+        build_policy(f"{memory}_modul", memory=options, device="meta")
 
 
 def test_a_backbone_of_no_size_is_refused():
