@@ -134,7 +134,7 @@ def test_a_missing_package_is_named_with_its_extra(module: str, monkeypatch: pyt
         (["backbone.kernel=4"], "must be odd"),
         (["backbone.groups=7"], "no multiple of backbone.groups=7"),
         (["processor.frames=some"], "processor.frames='some'"),
-        (["processor.window=0"], "processor.window must be .* got 0"),
+        (["processor.window=0"], "processor.window=0"),
     ],
 )
 def test_what_cannot_be_is_reported(words: list[str], says: str) -> None:
