@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import check_sizes, require
+from mme_vla.errors import UserError, check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, ScoringMemory
 from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
@@ -32,8 +32,8 @@ class ChangeScorer(FrameScorer):
         if frame_index and (frame_index + 1) % self.stride:
             return None
         height, width, _ = frame.shape
-        divides = height % self.grid == width % self.grid == 0
-        require(divides, f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches.")
+        if height % self.grid or width % self.grid:
+            raise UserError(f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches.")
         image = frame.astype(np.float32) / 255 * 2 - 1
         reference, self._reference = self._reference, image
         if reference is None or frame_index == 0:
