@@ -30,7 +30,7 @@ from timing import machine
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from mme_vla.backbone.attention import MaskLayout, Span, attend, build_mask
+from mme_vla.backbone.layers import MaskLayout, Span, attend, build_mask
 from mme_vla.integration.base import MEMORY_VISIBILITY
 
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from mme_vla.errors import UserError
     from mme_vla.evaluation.api import evaluate
     from mme_vla.integration.base import Integration
-    from mme_vla.memory.base import Memory
-    from mme_vla.memory.encoder import PerceptualMemory
+    from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
     from mme_vla.memory.recurrent import RecurrentMemory
     from mme_vla.policy.base import Policy
@@ -42,8 +41,7 @@ _MODULES = {
     "errors": ["UserError"],
     "evaluation.api": ["evaluate"],
     "integration.base": ["Integration"],
-    "memory.base": ["Memory"],
-    "memory.encoder": ["PerceptualMemory"],
+    "memory.base": ["Memory", "PerceptualMemory"],
     "memory.history": ["CachedHistory", "History", "OnlineHistory", "StorageSpec"],
     "memory.recurrent": ["RecurrentMemory"],
     "policy.base": ["Policy"],

@@ -154,7 +154,7 @@ def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tupl
 
 def build_memory(cfg: DictConfig) -> "Memory":
     """The memory the configuration names, of any width: it is only asked to select."""
-    from mme_vla.backbone.config import shape_of
+    from mme_vla.backbone.building import shape_of
     from mme_vla.policy import mme
 
     config: Any = OmegaConf.to_container(cfg, resolve=True)

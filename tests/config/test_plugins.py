@@ -31,7 +31,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.base import PerceptualMemory
 from mme_vla.registry import MEMORIES
 
 

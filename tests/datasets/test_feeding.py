@@ -15,7 +15,7 @@ from mme_vla.errors import UserError
 from mme_vla.memory.history import FrameScores
 from mme_vla.memory.tokendrop import FIRST_FRAME_SCORE, THRESHOLD, ranked_patches
 from mme_vla.policy.finetune import apply_finetuning, cast_frozen
-from mme_vla.speed.recompute import SAVED_OPS
+from mme_vla.speed import SAVED_OPS
 from mme_vla.training.order import readers
 from mme_vla.utils import files_to_hold
 

@@ -8,8 +8,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import layout_mask
 from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, StaticKV
+from mme_vla.backbone.layers import layout_mask
 from mme_vla.errors import UserError, raise_if
 from mme_vla.integration.modulator import Modulator
 from mme_vla.policy.mme import MMEPolicy
