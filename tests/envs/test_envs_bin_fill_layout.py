@@ -8,8 +8,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 import numpy as np
 
-from helpers.env_cubes import COLOURS, least_distance, read_button, read_cube
-from helpers.env_unmask import make, wait
+from helpers.env_tasks import COLOURS, least_distance, make, read_button, read_cube, wait
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.bin_fill import BinFill
 

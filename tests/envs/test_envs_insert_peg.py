@@ -9,8 +9,7 @@ import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import steps_of_demonstration
-from helpers.env_unmask import make, texts, wait
+from helpers.env_tasks import make, steps_of_demonstration, texts, wait
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.scene.articulated import Peg
 from mme_vla.envs.scene.objects import at

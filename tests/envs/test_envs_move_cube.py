@@ -8,8 +8,7 @@ import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import read_cube, read_disc, steps_of_demonstration
-from helpers.env_unmask import make, texts, wait
+from helpers.env_tasks import make, read_cube, read_disc, steps_of_demonstration, texts, wait
 from mme_vla.envs.scene.objects import H
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.things import Thing, distance_xy

@@ -182,18 +182,9 @@ def test_the_stick_robot_moves_as_recorded(h5_folder):
     env.close()
 
 
-def test_the_first_images_are_the_recorded_ones(h5_folder):
-    try:
-        backend = render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
-    env = PickXtimes(obs_mode="rgb+depth+segmentation", render_backend=backend, seed=1800, difficulty="easy")
+def test_objects_have_their_pixels_where_the_official_images_show_them(h5_folder, renderer):
+    env = PickXtimes(obs_mode="rgb+depth+segmentation", render_backend=renderer, seed=1800, difficulty="easy")
     sensors = env.step(recorded(h5_folder, *PICK, "action/joint_action")[0].astype(np.float32))[0]["sensor_data"]
-    for camera, name in (("base_camera", "front"), ("hand_camera", "wrist")):
-        image, depth = (sensors[camera][key][0].numpy().astype(int) for key in ("rgb", "depth"))
-        # Equal with the renderer of the recording; drivers differ a little in shading.
-        assert np.abs(image - recorded(h5_folder, *PICK, f"obs/{name}_rgb")[0]).mean() < 2
-        assert np.abs(depth - recorded(h5_folder, *PICK, f"obs/{name}_depth")[0]).mean() < 0.5
     pixels = sensors["base_camera"]["segmentation"][0, ..., 0].numpy()
     assert centroid(pixels, env.cube.segmentation_ids) == (53, 144)
     assert centroid(pixels, env.target.segmentation_ids) == (92, 108)
@@ -201,18 +192,14 @@ def test_the_first_images_are_the_recorded_ones(h5_folder):
     env.close()
 
 
-def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed() -> None:
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed(renderer: str) -> None:
     from mme_vla.envs.scene.motions import Mark, build_mark
 
     def fill(env: Scene) -> None:
         env.add(build_disc(env, "target", 0.04, 0.005, "gray", (0.0, 0.0)))
         env.add(build_mark(env, "mark", 0.0402, 0.014))
 
-    env = Scene(fill, obs_mode="rgb", render_backend=render_backend(), sim_backend="physx_cpu")
+    env = Scene(fill, obs_mode="rgb", render_backend=renderer, sim_backend="physx_cpu")
     target, disc = (next(thing for thing in env.things if thing.name == name) for name in ("target", "mark"))
     body = disc.entity._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
 

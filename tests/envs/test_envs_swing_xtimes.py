@@ -1,30 +1,25 @@
 """SwingXtimes: layout, how swings are counted and marked, and everything that fails."""
 
-from collections.abc import Iterator
-
 import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube, read_disc
-from helpers.env_unmask import make, push_down, texts, wait
+from helpers.env_tasks import (
+    COLOURS,
+    Hand,
+    least_distance,
+    push_down,
+    read_button,
+    read_cube,
+    read_disc,
+    wait,
+)
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.swing_xtimes import SwingXtimes
 
 LOW = 0.11
 
-
-@pytest.fixture(scope="module")
-def swing() -> Iterator[SwingXtimes]:
-    env = make(SwingXtimes, 3601, "medium")
-    yield env
-    env.close()
-
-
-@pytest.fixture
-def hand(swing: SwingXtimes, monkeypatch: pytest.MonkeyPatch) -> Hand:
-    swing.reset()
-    return Hand(swing, monkeypatch)
+SCENE = (SwingXtimes, 3601, "medium")
 
 
 def swing_all(env: SwingXtimes, hand: Hand) -> None:
@@ -40,8 +35,8 @@ def swing_all(env: SwingXtimes, hand: Hand) -> None:
     [(1, "easy", 1, {1, 2, 3}), (2, "easy", 1, {1, 2, 3}), (3, "medium", 3, {1, 2}), (7, "medium", 3, {1, 2}),
      (5, "hard", 3, {3}), (8, "hard", 3, {3})],
 )  # fmt: skip
-def test_everything_comes_from_the_stream_in_order(seed, difficulty, cubes, counts):
-    env = make(SwingXtimes, seed, difficulty)
+def test_everything_comes_from_the_stream_in_order(made, seed, difficulty, cubes, counts):
+    env = made(SwingXtimes, seed, difficulty)
     assert env.repetitions == Draws(seed).integer(min(counts), max(counts) + 1) and env.repetitions in counts
     stream = Draws(seed)
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
@@ -53,84 +48,70 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, cubes, coun
     read_disc(stream, Region((-0.1, 0.2), 0.1), env.left)
     assert env.cube is env.cubes[stream.integer(0, cubes)]
     assert least_distance(env.cubes) >= 0.04 and env.right.position[1] < env.left.position[1]
-    env.close()
 
 
-def test_swings_then_down_then_the_button_are_success(swing, hand):
-    swing_all(swing, hand)
-    assert swing.progress.current.text.startswith("put the")
+def test_swings_then_down_then_the_button_are_success(env, hand):
+    swing_all(env, hand)
+    assert env.progress.current.text.startswith("put the")
     hand.release()
-    assert swing.progress.current.text == "press the button"
-    assert push_down(swing, swing.button) == (True, False)
-    assert wait(swing) == (True, False)
+    assert env.progress.current.text == "press the button"
+    assert push_down(env, env.button) == (True, False)
+    assert wait(env) == (True, False)
 
 
-def test_too_high_or_beside_the_target_is_no_swing(swing, hand):
-    hand.carry(swing.cube)
-    hand.carry(swing.cube, over=swing.right, z=0.15)
-    assert swing.progress.index == 1 and swing.swings[0].count == 0
-    hand.carry(swing.cube, over=swing.left, z=LOW)
-    assert swing.progress.index == 1 and swing.swings[1].count == 1  # counted, but not the one that is due
-    hand.carry(swing.cube, over=swing.right, z=LOW)
-    assert swing.progress.index == 2
+def test_too_high_or_beside_the_target_is_no_swing(env, hand):
+    hand.carry(env.cube)
+    hand.carry(env.cube, over=env.right, z=0.15)
+    assert env.progress.index == 1 and env.swings[0].count == 0
+    hand.carry(env.cube, over=env.left, z=LOW)
+    assert env.progress.index == 1 and env.swings[1].count == 1  # counted, but not the one that is due
+    hand.carry(env.cube, over=env.right, z=LOW)
+    assert env.progress.index == 2
 
 
-def test_a_swing_ends_only_well_away_from_the_target(swing, hand):
-    hand.carry(swing.cube)
+def test_a_swing_ends_only_well_away_from_the_target(env, hand):
+    hand.carry(env.cube)
     for z in (LOW, 0.2, LOW, 0.28, LOW):
-        hand.carry(swing.cube, over=swing.right, z=z)
-    assert swing.swings[0].count == 1
-    hand.carry(swing.cube, over=swing.right, z=0.35)
-    hand.carry(swing.cube, over=swing.right, z=LOW)
-    assert swing.swings[0].count == 2
+        hand.carry(env.cube, over=env.right, z=z)
+    assert env.swings[0].count == 1
+    hand.carry(env.cube, over=env.right, z=0.35)
+    hand.carry(env.cube, over=env.right, z=LOW)
+    assert env.swings[0].count == 2
 
 
-def test_one_swing_too_many_fails_and_stays_failed(swing, hand):
-    swing_all(swing, hand)
-    assert hand.carry(swing.cube, over=swing.right, z=LOW) == (False, True)
-    assert hand.carry(swing.cube, over=swing.button) == (False, True)
+def test_one_swing_too_many_fails_and_stays_failed(env, hand):
+    swing_all(env, hand)
+    assert hand.carry(env.cube, over=env.right, z=LOW) == (False, True)
+    assert hand.carry(env.cube, over=env.button) == (False, True)
 
 
 @pytest.mark.parametrize("stage", ["pick", "swing", "put down"])
-def test_the_button_before_its_time_fails(swing, hand, stage):
+def test_the_button_before_its_time_fails(env, hand, stage):
     if stage == "swing":
-        hand.carry(swing.cube)
+        hand.carry(env.cube)
     elif stage == "put down":
-        swing_all(swing, hand)
-    assert push_down(swing, swing.button) == (False, True)
+        swing_all(env, hand)
+    assert push_down(env, env.button) == (False, True)
 
 
 @pytest.mark.parametrize("stage", ["pick", "press"])
-def test_another_cube_in_the_hand_fails(swing, hand, stage):
+def test_another_cube_in_the_hand_fails(env, hand, stage):
     if stage == "press":
-        swing_all(swing, hand)
+        swing_all(env, hand)
         hand.release()
-    other = next(cube for cube in swing.cubes if cube is not swing.cube)
+    other = next(cube for cube in env.cubes if cube is not env.cube)
     assert hand.carry(other) == (False, True)
 
 
-def test_a_target_is_highlighted_while_the_cube_is_over_it_and_20_steps_longer(swing, hand):
-    right, left = swing._marks
-    hand.carry(swing.cube, over=swing.right, z=LOW)
-    assert right.position == pytest.approx(swing.right.position - [0, 0, 0.01]) and left.position[2] < -5
-    hand.carry(swing.cube, over=swing.button)
-    wait(swing, 19)
-    assert right.position == pytest.approx(swing.right.position - [0, 0, 0.01])
-    wait(swing)
+def test_a_target_is_highlighted_while_the_cube_is_over_it_and_20_steps_longer(env, hand):
+    right, left = env._marks
+    hand.carry(env.cube, over=env.right, z=LOW)
+    assert right.position == pytest.approx(env.right.position - [0, 0, 0.01]) and left.position[2] < -5
+    hand.carry(env.cube, over=env.button)
+    wait(env, 19)
+    assert right.position == pytest.approx(env.right.position - [0, 0, 0.01])
+    wait(env)
     assert right.position[2] < -5
-
-
-def test_texts(swing):
-    colour, text = swing.cube.colour, texts(swing)
-    assert text[:3] + text[-2:] == [
-        (f"pick up the {colour} cube", f"pick up the {colour} cube at <>", "a"),
-        *((f"move to the top of the {side}-side target for the first time",
-           f"move to the top of the {side}-side target at <> for the first time", "b") for side in ("right", "left")),
-        (f"put the {colour} cube on the table", f"put the {colour} cube on the table", "c"),
-        ("press the button", "press the button at <>", "d"),
-    ]  # fmt: skip
-    assert len(text) == 3 + 2 * swing.repetitions
-    assert [option.needs_point for option in swing.choices()] == [True, True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -138,7 +119,7 @@ def test_texts(swing):
     [(1, "put it down on the left-side target"),
      (2, "move it to the top of the left-side target, repeating this back-and-forth motion two times")],
 )  # fmt: skip
-def test_goals(swing, monkeypatch, repetitions, middle):
-    monkeypatch.setattr(swing, "repetitions", repetitions)
-    start = f"pick up the {swing.cube.colour} cube, move it to the top of the right-side target, then"
-    assert swing.goals() == [f"{start} {middle}, finally press the button to stop"]
+def test_goals(env, monkeypatch, repetitions, middle):
+    monkeypatch.setattr(env, "repetitions", repetitions)
+    start = f"pick up the {env.cube.colour} cube, move it to the top of the right-side target, then"
+    assert env.goals() == [f"{start} {middle}, finally press the button to stop"]
