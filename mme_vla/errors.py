@@ -8,6 +8,18 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what to do."""
 
 
+def require(condition: object, message: str) -> None:
+    """Raise a `UserError` with this message unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
+def check_known(kind: str, value: object, known: Iterable[str]) -> None:
+    """Make sure that a name is one of those that exist, such as the name of a task."""
+    if value not in (names := list(known)):
+        raise UserError(f"Unknown {kind} {value!r}. {did_you_mean(str(value), names)}")
+
+
 def did_you_mean(name: str, options: Iterable[str]) -> str:
     """Return a sentence that lists `options`, with the ones nearest to `name` first in line.
 

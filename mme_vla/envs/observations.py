@@ -5,13 +5,12 @@ A frame is a dict with one value per observation key; the interface hands out li
 
 from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import check_known, require
 
 if TYPE_CHECKING:
     import gymnasium
@@ -70,10 +69,8 @@ class Include:
         """Read `include_front_depth=True` and the like."""
         known = {f"include_{field.name}" for field in fields(cls)}
         for name, value in options.items():
-            if name not in known:
-                raise UserError(f"Unknown option {name!r}. {did_you_mean(name, known)}")
-            if not isinstance(value, bool):
-                raise UserError(f"{name} is {value!r}; expected True or False.")
+            check_known("option", name, known)
+            require(isinstance(value, bool), f"{name} is {value!r}; expected True or False.")
         return cls(**{name.removeprefix("include_"): value for name, value in options.items()})
 
     @property
@@ -218,11 +215,6 @@ def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:
 
 def front_extrinsic() -> np.ndarray:
     """World-to-camera matrix of the front camera, float32 [3, 4]; it never moves."""
-    return _front_extrinsic().copy()
-
-
-@cache
-def _front_extrinsic() -> np.ndarray:
     forward = _FRONT_TARGET - _FRONT_EYE
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])

@@ -1,4 +1,4 @@
-"""BinFill: what counts as filled, and everything that fails."""
+"""BinFill: the layout, when cubes appear, what counts as filled, and everything that fails."""
 
 from collections import Counter
 
@@ -6,15 +6,22 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
+import numpy as np
 import sapien
 
-from helpers.env_tasks import COLOURS, Flags, Hand, push_down, texts, wait
+from helpers.env_tasks import COLOURS, Flags, Hand, least_distance, push_down, read_button, read_cube, wait
 from mme_vla.envs.scene.objects import Cube
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.bin_fill import BinFill
 
-SCENE = 1  # seed of a scene whose cubes are all there from the start
+STREAMING, STATIC = 4, 1  # seeds: cubes appear one after another, or are all there from the start
+TABLE = Region((-0.1, 0), (0.2, 0.25))
+AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
+GOAL_COLOURS = {"easy": (1, 1), "medium": (1, 2), "hard": (2, 3)}
+GOAL_CUBES = {"easy": (1, 3), "medium": (2, 4), "hard": (3, 5)}
+CUBES = {"easy": (4, 6), "medium": (8, 10), "hard": (10, 12)}
 
-SCENE = (BinFill, 1, "hard")  # whose cubes are all there from the start
+SCENE = (BinFill, STATIC, "hard")
 
 
 def put(env: BinFill, hand: Hand, cube: Cube) -> Flags:
@@ -81,19 +88,57 @@ def test_a_surplus_cube_fails_when_the_button_is_due(env, hand):
     assert put(env, hand, left) == (False, True)
 
 
-def test_texts_and_goals(env, monkeypatch):
-    colour = next(colour for colour in env.order if env.goal[colour])
-    assert texts(env)[:2] + texts(env)[-1:] == [
-        (f"pick up the first {colour} cube", f"pick up the first {colour} cube at <>", "a"),
-        ("put it into the bin", "put it into the bin at <>", "b"),
-        ("press the button", "press the button at <>", "c"),
-    ]
-    assert len(texts(env)) == 2 * env.goal.total() + 1
-    monkeypatch.setattr(env, "goal", Counter(green=2, blue=1))
-    assert env.goals() == [
-        f"put one blue cube and two green cubes into the bin{end} press the button to stop"
-        for end in (", then", " and")
-    ]
-    monkeypatch.setattr(env, "goal", Counter(green=2, blue=1, red=1))
-    assert env.goals()[0].startswith("put one red cube, one blue cube and two green cubes into the bin, then press")
-    assert [option.needs_point for option in env.choices()] == [True, False, False]
+@pytest.mark.parametrize(("seed", "difficulty"), [(s, d) for d in AVAILABLE for s in (STATIC, STREAMING)])
+def test_everything_comes_from_the_stream_in_order(made, seed, difficulty):
+    env = made(BinFill, seed, difficulty)
+    stream = Draws(seed)
+    assert env.streaming == (stream.integer(0, 2) == 0) == (seed == STREAMING)
+    read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
+    x, y, yaw = (stream.uniform() for _ in range(3))
+    turn = np.deg2rad(-20 + 40 * yaw) / 2
+    expected = [-0.05 + 0.2 * x, -0.2 + 0.4 * y, 0.025, np.cos(turn), 0, 0, np.sin(turn)]
+    np.testing.assert_allclose([*env.board.pose.p, *env.board.pose.q], expected, atol=1e-6)
+    pool = [COLOURS[i] for i in stream.permutation(3)][: AVAILABLE[difficulty]]
+    colours, total = (stream.integer(low, high + 1) for low, high in (GOAL_COLOURS[difficulty], GOAL_CUBES[difficulty]))
+    goal = Counter(pool[stream.integer(0, colours)] for _ in range(total)) if colours > 1 else Counter(pool[:1] * total)
+    assert env.goal == goal and goal.total() == total
+    low, high = CUBES[difficulty]
+    cubes = stream.integer(low, high + 1)
+    spawned = {colour: max(1, goal[colour]) for colour in pool}
+    for _ in range(cubes - sum(spawned.values())):
+        spawned[pool[stream.integer(0, len(pool)) if len(pool) > 1 else 0]] += 1
+    assert {colour: len(env.cubes[colour]) for colour in pool} == spawned
+    expected_colours, indices = [colour for colour in COLOURS for _ in range(spawned.get(colour, 0))], Counter()
+    for i in stream.permutation(cubes):
+        read_cube(stream, TABLE, env.cubes[expected_colours[i]][indices[expected_colours[i]]])
+        indices[expected_colours[i]] += 1
+    stream.permutation(3)  # an episode is initialised twice
+    assert env.order == [("blue", "red", "green")[i] for i in stream.permutation(3)]
+    assert len(env.all_cubes()) == cubes and least_distance(env.all_cubes()) >= 0.04
+
+
+def test_streaming_cubes_appear_50_steps_after_each_other(made):
+    env = made(BinFill, STREAMING, "easy")
+    cubes = env.all_cubes()
+
+    def present() -> list[bool]:
+        return [bool(cube.position[0] < 1) for cube in cubes]
+
+    wait(env, 50)
+    assert present() == [True] + [False] * (len(cubes) - 1)
+    wait(env)
+    assert present() == [True] * 2 + [False] * (len(cubes) - 2)
+    wait(env, 50)
+    assert present() == [True] * 3 + [False] * (len(cubes) - 3)
+    assert cubes[2].position == pytest.approx(cubes[2].initial_pose.p, abs=1e-3)
+
+
+def test_a_recovery_episode_has_another_order_of_colours(made):
+    env = made(BinFill, STATIC, "hard", recovery="z")
+    stream = Draws(0)
+    stream.restore(env._draws_state)
+    picks = env.goal.total()
+    stream.permutation(3)
+    stream.integer(0, picks)
+    assert env.order == [("blue", "red", "green")[i] for i in stream.permutation(3)]
+    assert env.failed_pick == stream.integer(0, picks)

@@ -1,11 +1,8 @@
 """The environment's contract: lists, infos, statuses, step counting, the conditioning video, errors."""
 
 import gc
-import json
 import sys
 import weakref
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -23,8 +20,6 @@ from mme_vla.errors import UserError
 STILL = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
 
 
-
-
 def test_a_closed_environment_gives_its_scene_up_at_once(make_unrendered) -> None:
     env = make_unrendered()
     env.reset()
@@ -35,16 +30,6 @@ def test_a_closed_environment_gives_its_scene_up_at_once(make_unrendered) -> Non
         assert scene() is None
     finally:
         gc.enable()
-
-
-
-
-
-
-
-
-
-
 
 
 def test_the_stick_s_video_leaves_out_what_is_not_recorded(make_unrendered) -> None:
@@ -126,9 +111,7 @@ def test_an_unreachable_pose_is_an_error_status(make_unrendered) -> None:
     assert "IK failed" in info["error_message"]
 
 
-def test_a_motion_that_cannot_be_planned_is_an_error_status(
-    make_unrendered, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_motion_that_cannot_be_planned_is_an_error_status(make_unrendered, monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_unrendered("PickXtimes", "train", 8, "waypoint")
     env.reset()
 
@@ -140,9 +123,7 @@ def test_a_motion_that_cannot_be_planned_is_an_error_status(
     assert (observation, terminated, info["exception_type"]) == (None, True, "PlanningError")
 
 
-def test_one_unplanned_video_motion_does_not_stop_the_video(
-    make_unrendered, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_unplanned_video_motion_does_not_stop_the_video(make_unrendered, monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_unrendered("VideoUnmask", "train", 4)
 
     def fail(*_: Any) -> None:

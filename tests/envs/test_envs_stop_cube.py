@@ -22,10 +22,12 @@ def a_seed(interval: int, visit: int) -> int:
     raise AssertionError
 
 
+SCENE = (StopCube, a_seed(60, 2), "easy")  # crossings at steps 30, 90, 150, ...
+
+
 @pytest.fixture
 def prepared(env: StopCube, monkeypatch: pytest.MonkeyPatch) -> StopCube:
     """The arm counts as being above the button."""
-    env.reset()
     monkeypatch.setattr("mme_vla.envs.tasks.stop_cube.hovering", lambda *_: True)
     return env
 
@@ -55,7 +57,6 @@ def test_everything_comes_from_the_stream_in_order(made, seed, difficulty):
 
 
 def test_the_cube_goes_back_and_forth_five_times_and_then_rests(env):
-    env.reset()
     start, target = env.cube.position, env.target.position
     end = 2 * target - start
     env.latch_failure, places = False, {0: start}
@@ -95,7 +96,6 @@ def test_not_stopped_before_the_stay_is_over_fails(prepared):
 
 
 def test_stopped_in_time_but_not_announced_is_not_yet_success(env):
-    env.reset()
     assert stop_at(env, 90) == (False, False) and env.progress.index == 0
 
 
@@ -111,7 +111,6 @@ def test_waiting_is_cut_at_every_100th_step_and_ends_before_the_crossing(env, mo
 
 
 def test_choosing_to_wait_leads_to_the_next_checkpoint(env):
-    env.reset()
     demo = Demonstrator(env, lambda action: env.step(np.asarray(action, np.float32)))
     env.choices()[1].run(demo, None)
     assert env.steps_done == 60  # whole gripper motions of six steps

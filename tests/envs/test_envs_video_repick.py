@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_tasks import COLOURS, least_distance, push_down, read_button, read_cube, wait
+from helpers.env_tasks import COLOURS, go_to, least_distance, push_down, read_button, read_cube, wait
 from mme_vla.envs.scene.placement import Draws, Region, rotated_anchors
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.video_repick import VideoRepick
@@ -17,11 +17,6 @@ SHOWN = ["pick up the cube", "drop the cube on the table"]
 PUT, PRESS = "put it down", "press the button to finish"
 
 SCENE = (VideoRepick, 1, "hard")  # two repetitions, no swaps
-
-
-def at(env: VideoRepick, text: str) -> None:
-    """Go to the first sub-task of the execution that has this text."""
-    env.progress.index = next(i for i, s in enumerate(env.progress.subtasks) if s.text == text and not s.video)
 
 
 def pressed_after(env: VideoRepick, steps: int) -> bool:
@@ -87,7 +82,7 @@ def test_the_video_ends_with_the_swaps_one_after_another(made):
 
 
 def test_as_many_picks_as_requested_and_the_button_are_success(env, hand):
-    at(env, FIRST)
+    go_to(env, FIRST)
     for _ in range(2):
         assert hand.carry(env.cube) == (False, False)
         assert hand.release() == (False, False)
@@ -99,7 +94,7 @@ def test_as_many_picks_as_requested_and_the_button_are_success(env, hand):
 
 @pytest.mark.parametrize("stage", [FIRST, PUT, SECOND])
 def test_another_cube_picked_up_is_a_lasting_failure(env, hand, stage):
-    at(env, stage)
+    go_to(env, stage)
     other = next(c for c in env.cubes if c is not env.cube and c.colour == env.cube.colour)
     assert hand.carry(other) == (False, True)
     assert hand.release() == (False, True)
@@ -107,7 +102,7 @@ def test_another_cube_picked_up_is_a_lasting_failure(env, hand, stage):
 
 @pytest.mark.parametrize("right", [True, False])
 def test_any_cube_picked_up_instead_of_pressing_fails(env, hand, right):
-    at(env, PRESS)
+    go_to(env, PRESS)
     assert hand.carry(env.cube if right else env.cubes[env.cubes.index(env.cube) - 1]) == (False, True)
     assert push_down(env, env.button) == (False, True)
 
@@ -115,7 +110,7 @@ def test_any_cube_picked_up_instead_of_pressing_fails(env, hand, right):
 @pytest.mark.parametrize("stage", [FIRST, PUT])
 @pytest.mark.parametrize(("steps", "fails"), [(0, False), (49, False), (50, True), (500, True), (501, False)])
 def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_entered(env, hand, stage, steps, fails):
-    at(env, stage)
+    go_to(env, stage)
     if stage == PUT:
         hand.carry(env.cube)  # which enters the stage, too
     env.evaluate()
@@ -124,7 +119,7 @@ def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_enter
 
 
 def test_picks_and_puts_have_a_timer_each_which_the_second_round_does_not_restart(env, hand):
-    at(env, FIRST)
+    go_to(env, FIRST)
     env.evaluate()
     env._elapsed_steps += 100
     hand.carry(env.cube)  # the pick is done
