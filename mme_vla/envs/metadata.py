@@ -223,8 +223,9 @@ def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
     require(isinstance(records, list) and records, again)
     specs = []
     for record in records:
-        fields = record if isinstance(record, dict) else {}
-        number, seed, difficulty = (fields.get(key) for key in ("episode", "seed", "difficulty"))
+        fields: dict[str, Any] = record if isinstance(record, dict) else {}
+        values: list[Any] = [fields.get(key) for key in ("episode", "seed", "difficulty")]
+        number, seed, difficulty = values
         whole = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
         require(
             whole and difficulty in list(_CYCLE),

@@ -14,7 +14,6 @@ from mme_vla.errors import check_known, require
 
 if TYPE_CHECKING:
     import gymnasium
-    import sapien
 
     from mme_vla.envs.task import Task
 
@@ -48,6 +47,7 @@ INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], 
 SENSORS = {"front": "base_camera", "wrist": "hand_camera"}
 """The benchmark's names of the cameras, and the simulator's."""
 _SCALAR_LAST = [1, 2, 3, 0]
+_OPENCV = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # from x forward, y left, z up
 _FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2])
 
 
@@ -177,7 +177,8 @@ class Observer:
         """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
         if name == "front":
             return front_extrinsic()
-        return extrinsic_of(self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose)
+        pose = self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
+        return (_OPENCV @ np.asarray(pose.inv().to_transformation_matrix(), np.float64)[:3]).astype(np.float32)
 
     def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
@@ -200,17 +201,6 @@ def read_images(
     sensor = task.scene.sensors[SENSORS[camera]]
     images = sensor.get_obs(rgb=rgb, depth=depth, position=False, segmentation=segmentation)
     return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
-
-
-def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:
-    """World-to-camera matrix in OpenCV's axes (x right, y down, z forward), float32 [3, 4].
-
-    Args:
-        pose: of the camera in the world, in the simulator's axes (x forward, y left, z up).
-    """
-    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    to_camera = np.asarray(pose.inv().to_transformation_matrix(), np.float64)
-    return (axes @ to_camera[:3]).astype(np.float32)
 
 
 def front_extrinsic() -> np.ndarray:

@@ -1,6 +1,7 @@
 """Scenes of the tests of tasks: physics alone, each built once a module."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -67,6 +68,19 @@ def make_unrendered() -> Iterator[Build]:
     yield build
     for env in envs:
         env.close()
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two converted episodes with poses and choices, the first with a conditioning video of 8 of its 24 frames."""
+    from helpers.h5_files import write_file
+    from mme_vla.data.convert import ConvertOptions, convert
+    from mme_vla.data.hdf5 import find_files, list_episodes
+
+    place = tmp_path_factory.mktemp("poses")
+    write_file(place / "record_dataset_Alpha.h5", [24, 20], videos=[8, 0], poses=True, choices=True)
+    convert(list_episodes(find_files([place])), place / "out", ConvertOptions(images="png"))
+    return place / "out"
 
 
 @pytest.fixture
