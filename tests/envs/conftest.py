@@ -31,8 +31,8 @@ def made() -> Iterator[Build]:
 
 @pytest.fixture
 def env(request: pytest.FixtureRequest, made: Build) -> Any:
-    """The module's `SCENE`, reset."""
-    return made(*request.module.SCENE)
+    """The module's `SCENE`, or that of the test, reset."""
+    return made(*getattr(request, "param", None) or request.module.SCENE)
 
 
 @pytest.fixture
