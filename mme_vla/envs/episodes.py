@@ -68,7 +68,7 @@ def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     tasks, task = (config.get(key) for key in ("tasks", "task"))
     one = task is None or tasks in (None, ALL, task)
     require(one, f"tasks={tasks} and task={task} mean the same: give one of them.")
-    names = tasks if task is None else task
+    names: Any = tasks if task is None else task
     require(names is not None, "Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
     return names if isinstance(names, str) else [str(name) for name in names]
 

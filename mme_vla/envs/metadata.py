@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError, brief, check_known, require
+from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
 from mme_vla.utils import read_json
 
@@ -92,7 +92,7 @@ def read_variant(split: str) -> Variant | None:
         raise UserError(
             f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(known)}."
         )
-    check_known("dial", match[1], known)
+    require(match[1] in known, f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}")
     return Variant(dial=match[1], turned=int(match[2]))
 
 
