@@ -10,7 +10,7 @@ Build = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def made() -> Iterator[Build]:
+def build_task() -> Iterator[Build]:
     """Builds a task of a seed and a difficulty, or resets the one that was built before."""
     from helpers.env_tasks import make
 
@@ -30,9 +30,9 @@ def made() -> Iterator[Build]:
 
 
 @pytest.fixture
-def env(request: pytest.FixtureRequest, made: Build) -> Any:
+def env(request: pytest.FixtureRequest, build_task: Build) -> Any:
     """The module's `SCENE`, or that of the test, reset."""
-    return made(*getattr(request, "param", None) or request.module.SCENE)
+    return build_task(*getattr(request, "param", None) or request.module.SCENE)
 
 
 @pytest.fixture

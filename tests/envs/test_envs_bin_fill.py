@@ -89,8 +89,8 @@ def test_a_surplus_cube_fails_when_the_button_is_due(env, hand):
 
 
 @pytest.mark.parametrize(("seed", "difficulty"), [(s, d) for d in AVAILABLE for s in (STATIC, STREAMING)])
-def test_everything_comes_from_the_stream_in_order(made, seed, difficulty):
-    env = made(BinFill, seed, difficulty)
+def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
+    env = build_task(BinFill, seed, difficulty)
     stream = Draws(seed)
     assert env.streaming == (stream.integer(0, 2) == 0) == (seed == STREAMING)
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
@@ -117,8 +117,8 @@ def test_everything_comes_from_the_stream_in_order(made, seed, difficulty):
     assert len(env.all_cubes()) == cubes and least_distance(env.all_cubes()) >= 0.04
 
 
-def test_streaming_cubes_appear_50_steps_after_each_other(made):
-    env = made(BinFill, STREAMING, "easy")
+def test_streaming_cubes_appear_50_steps_after_each_other(build_task):
+    env = build_task(BinFill, STREAMING, "easy")
     cubes = env.all_cubes()
 
     def present() -> list[bool]:
@@ -133,8 +133,8 @@ def test_streaming_cubes_appear_50_steps_after_each_other(made):
     assert cubes[2].position == pytest.approx(cubes[2].initial_pose.p, abs=1e-3)
 
 
-def test_a_recovery_episode_has_another_order_of_colours(made):
-    env = made(BinFill, STATIC, "hard", recovery="z")
+def test_a_recovery_episode_has_another_order_of_colours(build_task):
+    env = build_task(BinFill, STATIC, "hard", recovery="z")
     stream = Draws(0)
     stream.restore(env._draws_state)
     picks = env.goal.total()

@@ -22,9 +22,9 @@ OTHER = {"head": "tail", "tail": "head"}
 
 
 @pytest.fixture(params=[("head", 1), ("head", -1), ("tail", 1), ("tail", -1)], ids=lambda p: f"{p[0]}{p[1]:+}")
-def env(made, request, monkeypatch) -> InsertPeg:
+def env(build_task, request, monkeypatch) -> InsertPeg:
     """At the grasp of the execution; whatever is in the air is in the hand."""
-    env = made(InsertPeg, 13602, "medium")
+    env = build_task(InsertPeg, 13602, "medium")
     env.end, env.side = request.param
     env.progress.subtasks[:] = env.subtasks()
     env.progress.index = GRASPING
@@ -48,8 +48,8 @@ def insert(env: InsertPeg, grasped: str, side: int, short: float = 0.0) -> tuple
 
 
 @pytest.mark.parametrize(("seed", "difficulty"), [(0, "easy"), (1, "medium"), (2, "hard"), (3, "easy"), (4, "hard")])
-def test_each_initialisation_draws_anew_and_the_second_counts(made, seed, difficulty):
-    env, stream = made(InsertPeg, seed, difficulty), Draws(seed)
+def test_each_initialisation_draws_anew_and_the_second_counts(build_task, seed, difficulty):
+    env, stream = build_task(InsertPeg, seed, difficulty), Draws(seed)
     stream.uniform(), stream.uniform(), stream.uniforms(3), stream.integer(0, 3)
     for _ in range(2):
         box = [(stream.uniform() - 0.5) * 0.2 for _ in range(2)]
@@ -130,8 +130,8 @@ def test_on_the_way_back_from_the_video_the_pegs_are_where_they_were(env):
 
 
 @pytest.mark.parametrize("seed", [710002, 9000005, 9000014], ids=["beside the box", "flung off", "out of reach"])
-def test_where_the_official_demonstrator_fails_the_local_one_retries(made, seed: int):
-    env = made(InsertPeg, seed, "easy")
+def test_where_the_official_demonstrator_fails_the_local_one_retries(build_task, seed: int):
+    env = build_task(InsertPeg, seed, "easy")
     assert steps_of_demonstration(env) is not None
     env.second_tries = False
     env.reset()

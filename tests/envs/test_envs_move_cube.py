@@ -78,8 +78,8 @@ def test_video_and_execution_come_from_the_stream_in_order(seed, difficulty):
     env.close()
 
 
-def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(made, monkeypatch):
-    env = made(MoveCube, HOOK, "easy")
+def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(build_task, monkeypatch):
+    env = build_task(MoveCube, HOOK, "easy")
     in_hand = begin(env, monkeypatch, PICK_PEG)
     assert lift(env, in_hand, env.peg, [env.peg.tail]) == (False, False) and env.progress.index == 5
     put(env.cube, env.target.position, aside=0.055)
@@ -88,8 +88,8 @@ def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(made, monkey
     assert wait(env) == (True, False)
 
 
-def test_pushing_counts_once_the_gripper_opens(made, monkeypatch):
-    env = made(MoveCube, PUSH, "easy")
+def test_pushing_counts_once_the_gripper_opens(build_task, monkeypatch):
+    env = build_task(MoveCube, PUSH, "easy")
     begin(env, monkeypatch, PUSH_CUBE)
     closed = np.append(env.reset_action[:7], -1).astype(np.float32)
     for _ in range(5):
@@ -100,8 +100,8 @@ def test_pushing_counts_once_the_gripper_opens(made, monkeypatch):
     assert wait(env, 5) == (True, False)
 
 
-def test_grasping_and_placing_is_success(made, monkeypatch):
-    env = made(MoveCube, GRASP, "easy")
+def test_grasping_and_placing_is_success(build_task, monkeypatch):
+    env = build_task(MoveCube, GRASP, "easy")
     in_hand = begin(env, monkeypatch, PICK_CUBE)
     assert lift(env, in_hand, env.cube, [env.cube]) == (False, False) and env.progress.index == 5
     put(env.cube, env.target.position, aside=0.04)
@@ -114,28 +114,28 @@ def test_grasping_and_placing_is_success(made, monkeypatch):
     ("seed", "text", "wrong"),
     [(HOOK, PICK_PEG, "cube"), (PUSH, PUSH_CUBE, "cube"), (PUSH, PUSH_CUBE, "peg"), (GRASP, PICK_CUBE, "peg")],
 )
-def test_another_thing_in_the_hand_fails(made, monkeypatch, seed, text, wrong):
-    env = made(MoveCube, seed, "easy")
+def test_another_thing_in_the_hand_fails(build_task, monkeypatch, seed, text, wrong):
+    env = build_task(MoveCube, seed, "easy")
     in_hand = begin(env, monkeypatch, text)
     thing = getattr(env, wrong)
     assert lift(env, in_hand, thing, [thing] if wrong == "cube" else [env.peg.head]) == (False, True)
 
 
 @pytest.mark.parametrize(("seed", "text"), [(HOOK, PICK_PEG), (GRASP, PICK_CUBE)])
-def test_the_cube_on_the_target_too_early_fails(made, monkeypatch, seed, text):
-    env = made(MoveCube, seed, "easy")
+def test_the_cube_on_the_target_too_early_fails(build_task, monkeypatch, seed, text):
+    env = build_task(MoveCube, seed, "easy")
     begin(env, monkeypatch, text)
     put(env.cube, env.target.position, aside=0.04)
     assert wait(env) == (False, True)
 
 
 @pytest.mark.parametrize(("seed", "text", "thing"), [(HOOK, HOOK_CUBE, "cube"), (GRASP, PLACE_CUBE, "peg")])
-def test_in_the_last_stage_nothing_fails(made, monkeypatch, seed, text, thing):
-    env = made(MoveCube, seed, "easy")
+def test_in_the_last_stage_nothing_fails(build_task, monkeypatch, seed, text, thing):
+    env = build_task(MoveCube, seed, "easy")
     in_hand = begin(env, monkeypatch, text)
     assert lift(env, in_hand, getattr(env, thing), [env.cube, env.peg.head]) == (False, False)
 
 
 @pytest.mark.parametrize("seed", [HOOK, PUSH])
-def test_hook_and_push_are_demonstrated(made, seed):
-    assert steps_of_demonstration(made(MoveCube, seed, "easy")) is not None
+def test_hook_and_push_are_demonstrated(build_task, seed):
+    assert steps_of_demonstration(build_task(MoveCube, seed, "easy")) is not None

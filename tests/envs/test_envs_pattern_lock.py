@@ -52,8 +52,8 @@ def watch(env: PatternLock, tip: Tip) -> None:
 
 
 @pytest.mark.parametrize(("difficulty", "n"), [("easy", 3), ("medium", 4), ("hard", 5)])
-def test_the_grid_and_the_path_over_it(made, difficulty, n):
-    env = made(PatternLock, 1, difficulty)
+def test_the_grid_and_the_path_over_it(build_task, difficulty, n):
+    env = build_task(PatternLock, 1, difficulty)
     line = (np.arange(n) - (n - 1) / 2) * 0.1
     places = [(-0.1 + x, y, 0.01) for x in line for y in line]
     np.testing.assert_allclose([disc.position for disc in env.discs], places, atol=1e-6)

@@ -52,11 +52,11 @@ def watch(env: RouteStick, tip: Tip) -> None:
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("seed", [1, 2, 5])
-def test_everything_comes_from_the_stream_in_order(made, seed, difficulty, monkeypatch):
+def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty, monkeypatch):
     colours = []
     build = RouteStick.build.__globals__["build_obstacle"]
     monkeypatch.setitem(RouteStick.build.__globals__, "build_obstacle", lambda *a: colours.append(a[-1]) or build(*a))
-    env = made(RouteStick, seed, difficulty)
+    env = build_task(RouteStick, seed, difficulty)
     stream = Draws(seed)
     turn = Rotation.from_euler("z", -30 + 60 * stream.uniform(), degrees=True)
     visible, hidden, blocks = (

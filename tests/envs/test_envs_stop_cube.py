@@ -41,8 +41,8 @@ def stop_at(env: StopCube, step: int) -> Flags:
 
 
 @pytest.mark.parametrize(("seed", "difficulty"), [(1, "easy"), (2, "medium"), (3, "hard"), (4, "easy"), (5, "hard")])
-def test_everything_comes_from_the_stream_in_order(made, seed, difficulty):
-    env = made(StopCube, seed, difficulty)
+def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
+    env = build_task(StopCube, seed, difficulty)
     stream = Draws(seed)
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
     x, y = stream.between(-0.1, 0.1), stream.between(-0.1, 0.1)

@@ -28,9 +28,9 @@ AFTER = [PICK, "drop the cube onto table", "static", "static", "NO RECORD", PICK
 
 
 @pytest.fixture(params=[(VideoPlaceOrder, 1), (VideoPlaceButton, 2)], ids=["order", "button"])
-def env(request: pytest.FixtureRequest, made) -> VideoPlace:
+def env(request: pytest.FixtureRequest, build_task) -> VideoPlace:
     """Either task; the rules of the execution are the same."""
-    return made(*request.param, "hard")
+    return build_task(*request.param, "hard")
 
 
 def read_scene(stream: Draws, env: VideoPlace, targets: int) -> None:
@@ -64,8 +64,8 @@ def keeps_apart(env: VideoPlace) -> bool:
 
 @pytest.mark.parametrize(("difficulty", "targets"), [("easy", 3), ("medium", 4), ("hard", 4)])
 @pytest.mark.parametrize("seed", [2, 6])
-def test_button_everything_comes_from_the_stream_in_order(made, seed, difficulty, targets):
-    env, stream = made(VideoPlaceButton, seed, difficulty), Draws(seed)
+def test_button_everything_comes_from_the_stream_in_order(build_task, seed, difficulty, targets):
+    env, stream = build_task(VideoPlaceButton, seed, difficulty), Draws(seed)
     read_scene(stream, env, targets)
     assert env.before == (stream.uniform() < 0.5)
     assert env.spot.radius == 0.06 and env.spot.position[2] == pytest.approx(-0.05)
@@ -79,8 +79,8 @@ def test_button_everything_comes_from_the_stream_in_order(made, seed, difficulty
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("seed", [2, 6])
-def test_order_everything_comes_from_the_stream_in_order(made, seed, difficulty):
-    env, stream = made(VideoPlaceOrder, seed, difficulty), Draws(seed)
+def test_order_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
+    env, stream = build_task(VideoPlaceOrder, seed, difficulty), Draws(seed)
     read_scene(stream, env, targets=4)
     visits = stream.integer(2, 5)
     assert env.visited == [env.targets[i] for i in stream.permutation(4)[:visits]] and 2 <= len(env.visited) <= 4
@@ -138,7 +138,7 @@ def test_another_cube_picked_up_fails_instead_of_the_cube_only(env, hand):
     assert hand.carry(other) == (False, False)
 
 
-def test_a_demonstration_ends_in_success(made):
-    env = made(VideoPlaceButton, 10000, "easy")
+def test_a_demonstration_ends_in_success(build_task):
+    env = build_task(VideoPlaceButton, 10000, "easy")
     assert steps_of_demonstration(env) is not None
     assert distance_xy(env.cube.position, env.goal_target.position) < 0.05

@@ -30,8 +30,8 @@ def pressed_after(env: VideoRepick, steps: int) -> bool:
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_everything_comes_from_one_stream_in_order(made, seed, difficulty):
-    env, stream = made(VideoRepick, seed, difficulty, recovery="z"), Draws(seed)
+def test_everything_comes_from_one_stream_in_order(build_task, seed, difficulty):
+    env, stream = build_task(VideoRepick, seed, difficulty, recovery="z"), Draws(seed)
     assert env.repetitions == stream.integer(1, 4) and env.repetitions in (1, 2, 3)
     low, high = SWAPS.get(difficulty, (0, 0))
     assert low <= env.swap_count <= high and env.swap_count == stream.integer(low, high + 1)
@@ -56,8 +56,8 @@ def test_everything_comes_from_one_stream_in_order(made, seed, difficulty):
     assert min(distance_xy(cube.position, env.button.position) for cube in env.cubes) > 0.05625 + 0.04
 
 
-def test_the_video_ends_with_the_swaps_one_after_another(made):
-    env = made(VideoRepick, ONCE, "medium")
+def test_the_video_ends_with_the_swaps_one_after_another(build_task):
+    env = build_task(VideoRepick, ONCE, "medium")
     assert env.repetitions == 1 and env.swap_count == 3
     video = [*SHOWN, *["static"] * 4, "NO RECORD"]
     assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]

@@ -59,8 +59,8 @@ def do(env, hand: Hand, done: str) -> None:
         (SwingXtimes, 5, "hard", 3, {3}), (SwingXtimes, 8, "hard", 3, {3}),
     ],
 )  # fmt: skip
-def test_everything_comes_from_the_stream_in_order(made, task, seed, difficulty, cubes, counts):
-    env, stream = made(task, seed, difficulty), Draws(seed)
+def test_everything_comes_from_the_stream_in_order(build_task, task, seed, difficulty, cubes, counts):
+    env, stream = build_task(task, seed, difficulty), Draws(seed)
     assert env.repetitions == Draws(seed).integer(min(counts), max(counts) + 1) and env.repetitions in counts
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
     assert [cube.colour for cube in env.cubes] == [COLOURS[i] for i in stream.permutation(3)][:cubes]
@@ -207,8 +207,8 @@ def test_a_target_is_highlighted_while_the_cube_is_over_it_and_20_steps_longer(e
     [(1, "easy", 3, 1), (2, "easy", 3, 1), (3, "medium", 4, 2), (4, "medium", 4, 2), (5, "hard", 6, 3),
      (6, "hard", 6, 3)],
 )  # fmt: skip
-def test_highlighted_cubes_come_from_the_stream_in_order(made, seed, difficulty, cubes, goals):
-    env = made(PickHighlight, seed, difficulty)
+def test_highlighted_cubes_come_from_the_stream_in_order(build_task, seed, difficulty, cubes, goals):
+    env = build_task(PickHighlight, seed, difficulty)
     stream = Draws(seed)
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
     assert len(env.cubes) == cubes

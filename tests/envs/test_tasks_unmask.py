@@ -29,13 +29,13 @@ RANGES = {"easy": (3, (1, 2), (1, 2)), "medium": (4, (1, 2), (1, 1)), "hard": (4
 
 
 @pytest.fixture(params=SEEDS, ids=lambda task: task.__name__)
-def env(made, request) -> Any:
-    return made(request.param, SEEDS[request.param], "hard")
+def env(build_task, request) -> Any:
+    return build_task(request.param, SEEDS[request.param], "hard")
 
 
 @pytest.fixture(params=SWAPPING, ids=lambda task: task.__name__)
-def swap(made, request) -> Any:
-    return made(request.param, SEEDS[request.param], "hard")
+def swap(build_task, request) -> Any:
+    return build_task(request.param, SEEDS[request.param], "hard")
 
 
 def hiding(env) -> list[Thing]:
@@ -65,8 +65,8 @@ def go_to_picks(env) -> int:
     [(1, "easy", {3}), (2, "easy", {3}), (3, "medium", {5}), (4, "medium", {5}), (5, "hard", {4, 5, 6}),
      (6, "hard", {4, 5, 6}), (7, "hard", {4, 5, 6})],
 )  # fmt: skip
-def test_containers_stand_apart_where_the_stream_puts_them(made, task, seed, difficulty, counts):
-    env, stream = made(task, seed, difficulty), Draws(seed)
+def test_containers_stand_apart_where_the_stream_puts_them(build_task, task, seed, difficulty, counts):
+    env, stream = build_task(task, seed, difficulty), Draws(seed)
     for button in buttons(env):
         offset = (stream.uniforms(2).numpy() - 0.5) * 0.1
         np.testing.assert_allclose(button.pose.p[:2], np.array([-0.2, 0]) + offset, atol=1e-6)
@@ -86,8 +86,8 @@ def test_containers_stand_apart_where_the_stream_puts_them(made, task, seed, dif
 
 @pytest.mark.parametrize("difficulty", RANGES)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_video_swap_everything_comes_from_the_streams_in_order(made, seed, difficulty):
-    env = made(VideoUnmaskSwap, seed, difficulty, recovery="z")
+def test_video_swap_everything_comes_from_the_streams_in_order(build_task, seed, difficulty):
+    env = build_task(VideoUnmaskSwap, seed, difficulty, recovery="z")
     count, swaps, picks = RANGES[difficulty]
     stream = Draws(seed)
     assert env.swap_count == stream.integer(swaps[0], swaps[1] + 1)
@@ -112,8 +112,8 @@ def test_video_swap_everything_comes_from_the_streams_in_order(made, seed, diffi
 
 @pytest.mark.parametrize("difficulty", RANGES)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_button_swap_everything_comes_from_the_stream_in_order(made, seed, difficulty):
-    env, stream = made(ButtonUnmaskSwap, seed, difficulty), Draws(seed)
+def test_button_swap_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
+    env, stream = build_task(ButtonUnmaskSwap, seed, difficulty), Draws(seed)
     for button, y in ((env.left, -0.1), (env.right, 0.1)):
         offset = (stream.uniforms(2).numpy() - 0.5) * 0.05
         np.testing.assert_allclose(button.pose.p[:2], np.array([-0.2, y]) + offset, atol=1e-6)
@@ -130,18 +130,18 @@ def test_button_swap_everything_comes_from_the_stream_in_order(made, seed, diffi
 
 
 @pytest.mark.parametrize("seed", [8303, 8304, 8305])
-def test_the_pick_that_recovery_fails_has_a_separate_stream(made, seed):
+def test_the_pick_that_recovery_fails_has_a_separate_stream(build_task, seed):
     stream = Draws(seed)
     stream.integer(1, 6)
-    assert made(ButtonUnmask, seed, "hard", recovery="z").failed_pick == stream.integer(0, 2)
+    assert build_task(ButtonUnmask, seed, "hard", recovery="z").failed_pick == stream.integer(0, 2)
 
 
 # Covering and swaps -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("task", STILL)
-def test_cubes_lie_open_for_half_of_the_time_and_are_covered_then(made, task):
-    env = made(task, SEEDS[task], "hard")
+def test_cubes_lie_open_for_half_of_the_time_and_are_covered_then(build_task, task):
+    env = build_task(task, SEEDS[task], "hard")
     cubes = [thing for thing in env.things if thing not in [*env.containers, *buttons(env)]]
     assert env.progress.current.video == (task is VideoUnmask)
     wait(env, 32)
@@ -152,17 +152,17 @@ def test_cubes_lie_open_for_half_of_the_time_and_are_covered_then(made, task):
     assert under(cubes, env.containers[:3]) and [cube.colour for cube in cubes] == env.colours
 
 
-def test_the_video_lasts_until_the_last_motion_has_ended(made):
+def test_the_video_lasts_until_the_last_motion_has_ended(build_task):
     for task, length in ((VideoUnmask, COVER_STEPS), (VideoUnmaskSwap, 64 + 50 * 3)):
-        env = made(task, SEEDS[task], "hard")
+        env = build_task(task, SEEDS[task], "hard")
         wait(env, length - 1)
         assert env.progress.index == 0
         wait(env)
         assert env.progress.index == 1
 
 
-def test_two_containers_change_places_at_a_time_and_the_others_stand_still(made):
-    env = made(VideoUnmaskSwap, 5300, "hard")
+def test_two_containers_change_places_at_a_time_and_the_others_stand_still(build_task):
+    env = build_task(VideoUnmaskSwap, 5300, "hard")
     wait(env, 65)
     for initiator in env.initiators:
         start = {container: container.pose for container in env.containers}
@@ -200,8 +200,8 @@ def test_cubes_are_away_while_containers_move_and_lie_under_the_same_ones_then(s
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-def test_buttons_may_be_pressed_in_either_order_but_both_must_be(made, reverse):
-    env = made(ButtonUnmaskSwap, 7300, "hard")
+def test_buttons_may_be_pressed_in_either_order_but_both_must_be(build_task, reverse):
+    env = build_task(ButtonUnmaskSwap, 7300, "hard")
     wait(env, 40)
     first, second = [env.left, env.right][:: -1 if reverse else 1]
     for button, index in ((first, 1), (first, 1), (second, 2)):
@@ -214,8 +214,8 @@ def test_buttons_may_be_pressed_in_either_order_but_both_must_be(made, reverse):
     assert env.progress.index == 1
 
 
-def test_a_reset_releases_the_button(made):
-    env = made(ButtonUnmask, 8300, "hard")
+def test_a_reset_releases_the_button(build_task):
+    env = build_task(ButtonUnmask, 8300, "hard")
     push_down(env, env.button)
     env.reset()
     assert env.button.depth == 0
