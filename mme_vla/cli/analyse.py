@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
-from mme_vla.errors import UserError, require_choice
+from mme_vla.errors import UserError, check_choice
 from mme_vla.utils import safe_name
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def cost(args: argparse.Namespace) -> None:
     known = all_models()
     models = args.models or (["framesamp_modul", "tokendrop_modul"] if args.budgets is not None else known)
     for model in models:
-        require_choice("model", model, known)
+        check_choice("model", model, known)
     if args.budgets is not None:
         success = {int(row["memory_tokens"]): row for row in paper_table("memory_budget")}
         rows = []

@@ -14,7 +14,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
 from mme_vla.config.composition import plain
 from mme_vla.config.devices import find_device
-from mme_vla.errors import require_choice
+from mme_vla.errors import check_choice
 
 if TYPE_CHECKING:
     import torch
@@ -117,7 +117,7 @@ def choose_subgoals(
     from mme_vla.processing.prompt import subgoal_kind
     from mme_vla.subgoal import BackgroundPredictor, build_predictor
 
-    require_choice("subgoal_mode", mode, SUBGOAL_MODES)
+    check_choice("subgoal_mode", mode, SUBGOAL_MODES)
     if section is None:
         if policy.require_processor().prompt_spec.reads_subgoal:
             logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from omegaconf import DictConfig
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, raise_if, require_choice
+from mme_vla.errors import UserError, check_choice, require
 
 if TYPE_CHECKING:
     import torch
@@ -62,11 +62,11 @@ def load_policy(
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)
         return LoadedPolicy(policy, name, where)
-    raise_if(
-        not any(word.startswith("model=") for word in named),
+    require(
+        any(word.startswith("model=") for word in named),
         f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out.",
     )
-    raise_if(cfg.dtype not in ("auto", "float32"), f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
+    require(cfg.dtype in ("auto", "float32"), f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
     robot = policy.embodiment
     policy.require_processor().stats = NormStats.unit(robot.state.width, robot.action.width)
@@ -82,7 +82,7 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
     """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
     from mme_vla.policy.capabilities import CompilesSampling
 
-    require_choice("sampling", sampling, SAMPLING)
+    check_choice("sampling", sampling, SAMPLING)
     on_gpu = policy.device.type == "cuda"
     if sampling == "graph" and not on_gpu:
         raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")

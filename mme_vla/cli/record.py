@@ -18,7 +18,7 @@ from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.utils.processes import end_with_parent, signals_deferred
 
@@ -190,9 +190,7 @@ def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
     memory: Any
     frames, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
     if frames == "all":
-        raise_if(
-            memory is not None, "frames=all draws every frame, those of a memory too: leave out memory, or set frames."
-        )
+        require(memory is None, "frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
         return None
     return FrameChoice(frames, memory)
 
@@ -251,8 +249,8 @@ def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
 
 def _claim(work: Path, jobs: Sequence[Job]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
-    raise_if(
-        not claim_plan(work, [job.plan for job in jobs]),
+    require(
+        claim_plan(work, [job.plan for job in jobs]),
         f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
         "another output, or remove that folder yourself.",
     )

@@ -37,7 +37,7 @@ from mme_vla.config.naming import (
     variant_name,
 )  # fmt: skip
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 
 VERSION_BASE = "1.3"
 
@@ -108,7 +108,7 @@ def compose(
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     for folder in trees:
-        raise_if(not folder.is_dir(), f"The config folder {str(folder)!r} does not exist.")
+        require(folder.is_dir(), f"The config folder {str(folder)!r} does not exist.")
     words = several_memories(overrides)
     with local_hydra(trees[0], trees[1:]) as engine:
         tree = ConfigTree(engine.config_loader, config_name, parse(words))

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError, brief, listed, raise_if
+from mme_vla.errors import UserError, brief, listed, require
 
 TRUST_FLAG, TRUST_WORD = "--trust-plugins", "trust_plugins=true"
 """How one says on a command line that the plugins of a checkpoint may be imported; every command takes both."""
@@ -65,8 +65,8 @@ def import_trusted(config: Any, source: str, trust: bool) -> None:
     """
     names = plugins_of(config, source)
     strange = [name for name in names if name not in sys.modules]
-    raise_if(
-        not (not strange or trust),
+    require(
+        not strange or trust,
         f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that would run on this "
         f"machine. If you know it and trust it, say so with {TRUST_FLAG} (from Python trust_plugins=True), and "
         "start where the module can be found: in its folder, or with it installed.",

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.envs.metadata import SESSIONS, read_variant
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.base import Policy
@@ -226,7 +226,7 @@ def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -
     """
     variant = read_variant(split)
     if variant is None or variant.dial != SESSIONS:
-        raise_if(recordings, f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
+        require(not recordings, f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
         return policy
     count = variant.sessions
     if not count:

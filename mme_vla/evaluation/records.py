@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
-from mme_vla.errors import UserError, raise_if, require_choice
+from mme_vla.errors import UserError, check_choice, require
 from mme_vla.utils import parse_json, to_line, verified
 
 Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
@@ -120,7 +120,7 @@ class EpisodeRecord:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Read the object of a line, without its checksum."""
         record = read_section(cls, {**values, "seconds": values.get("seconds") or {}}, "record")
-        require_choice("record.outcome", record.outcome, OUTCOMES)
+        check_choice("record.outcome", record.outcome, OUTCOMES)
         return record
 
 
@@ -132,7 +132,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
 
     records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
-    require_choice("conflicts", conflicts, ("refuse", "first", "last"))
+    check_choice("conflicts", conflicts, ("refuse", "first", "last"))
     merged: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
     for new in records:
         at = (new.run, new.key)
@@ -140,15 +140,15 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
         if old is None or (old.outcome == "error" and new.outcome != "error"):
             merged[at] = new
             continue
-        raise_if(
-            new.seed != old.seed,
+        require(
+            new.seed == old.seed,
             f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
             "these are not the same benchmark; evaluate both from the same episode metadata.",
         )
         if new.outcome in (old.outcome, "error"):
             continue
-        raise_if(
-            conflicts == "refuse",
+        require(
+            conflicts != "refuse",
             f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
             f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last.",
         )

@@ -18,7 +18,7 @@ from urllib.parse import quote, unquote
 from mme_vla.config.naming import digest, flat
 from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compositions, finished
 from mme_vla.utils import (
     draft_of,
@@ -78,8 +78,8 @@ def read_run(folder: Path) -> dict[str, Any]:
     """Read a folder's `run.json`."""
     path = folder / RUN_FILE
     content = read_json(path, "a run's settings", finite=False)
-    raise_if(
-        content.get("fingerprint") != fingerprint(content.get("settings", {})),
+    require(
+        content.get("fingerprint") == fingerprint(content.get("settings", {})),
         f"{path} is damaged or was changed manually: its settings do not have its fingerprint. Remove it if the "
         "records beside it are of this run.",
     )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
@@ -99,7 +99,7 @@ class Decisions(Dataset[int]):
         for demonstration in demonstrations:
             items += _items(policy, demonstration)
             distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
-        raise_if(not items, "The demonstrations hold no decision to learn from.")
+        require(items, "The demonstrations hold no decision to learn from.")
         return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise)
 
     @classmethod

@@ -19,7 +19,7 @@ from torch.nn import functional
 from mme_vla.backbone.nano import NanoBackbone, NanoConfig
 from mme_vla.backbone.nano_vision import CLASSES, COARSE, FINE, WORDS, ConvTower
 from mme_vla.config.sections import read_section
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.nano.scenes import LABEL_SIDE
 from mme_vla.processing.images import to_unit_range
 from mme_vla.processing.tokenizer import SAMPLE, Tokenizer
@@ -81,7 +81,7 @@ def class_words() -> Tensor:
 
 def load_scenes(files: Sequence[Path]) -> tuple[Tensor, Tensor]:
     """Images [n, 3, s, s] uint8 and labels [n, 64, 64] uint8 of recorded scenes."""
-    raise_if(not files, "There is no recorded scene to learn from.")
+    require(files, "There is no recorded scene to learn from.")
     images, labels = [], []
     for file in files:
         with np.load(file) as scene:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
 ONGOING = "ongoing"
@@ -105,7 +105,7 @@ class ChoiceSession:
 
     def start(self) -> Reveal:
         """Reset the environment, which shows the conditioning video, if any, and then the present frame."""
-        raise_if(self.reveals, "This session has begun; make a new one for another episode.")
+        require(not self.reveals, "This session has begun; make a new one for another episode.")
         started = self._clock()
         observation, info = self.env.reset()
         self._simulated += self._clock() - started
@@ -200,7 +200,7 @@ class ChoiceSession:
         self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
     ) -> EpisodeRecord:
         """The episode as evaluation keeps it, its decisions in `extra`."""
-        raise_if(not self.over, f"The episode is not over ({self.status}); there is nothing to record yet.")
+        require(self.over, f"The episode is not over ({self.status}); there is nothing to record yet.")
         which = self.episode
         ended = {"ended_by": self.ended_by} if self.ended_by else {}
         return EpisodeRecord(
@@ -248,5 +248,5 @@ def checked_point(point: Any, option: Option) -> tuple[float, float]:
         problem = f"needs two numbers as its point, a pixel's row and column; got {point!r}"
     elif not ((values >= 0) & (values < SIDE)).all():
         problem = f"needs a point of the image, and {point} lies outside of the image: 0 to {SIDE - 1}"
-    raise_if(problem, f"{what} {problem}.")
+    require(not problem, f"{what} {problem}.")
     return float(values[0]), float(values[1])

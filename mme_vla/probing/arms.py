@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief, raise_if
+from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.feed import Feed
 from mme_vla.policy.base import Policy
 from mme_vla.probing.channels import Channel, Remembered
@@ -49,7 +49,7 @@ class Arm:
         if not allowed:
             return None
         both: np.ndarray = reduce(np.intersect1d, allowed)
-        raise_if(not len(both), f"{self.name} leaves no frame to remember: its parts allow different ones.")
+        require(len(both), f"{self.name} leaves no frame to remember: its parts allow different ones.")
         return both
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, PositiveInt, Range, read_section
 from mme_vla.errors import require
-from mme_vla.speed import ALL, SELECTIVE, Recompute
+from mme_vla.speed import SELECTIVE, Recompute
 from mme_vla.training.parallel import ParallelSettings
 
 

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_tasks import Hand, lift, make, push_down, wait
+from helpers.env_tasks import Hand, make, push_down
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs import metadata

@@ -11,7 +11,7 @@ from PIL import Image
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.memory.base import Memory, make_scorer
 from mme_vla.memory.history import OnlineHistory
@@ -62,7 +62,7 @@ def replay(
         n_observed = step + 1
         if text is not None:
             texts = source.subgoals(episode, step)
-            raise_if(text.kind not in texts, f"{source.name} has no {text.kind}, which this policy reads.")
+            require(text.kind in texts, f"{source.name} has no {text.kind}, which this policy reads.")
             running.subgoal = texts[text.kind]
         policy.act([running])
         yield step, running
@@ -177,7 +177,7 @@ def selection_sheets(
         (step, image); images grow with what is remembered.
     """
     check_episode(source, episode)
-    raise_if(not every >= 1, f"every={every} must be at least 1: the steps between two images.")
+    require(every >= 1, f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
     history, patches = OnlineHistory(memory.storage, make_scorer(memory), start), memory.storage.grid**2

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, StaticKV
 from mme_vla.backbone.layers import layout_mask
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.integration.modulator import Modulator
 from mme_vla.policy.mme import MMEPolicy
 
@@ -69,7 +69,7 @@ class Watch[T]:
         return self._checked(since)
 
     def _checked(self, sums: Tensor) -> T:
-        raise_if(not sums.any(), f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.")
+        require(sums.any(), f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.")
         return self._read(sums)
 
     def _hooks(self) -> list[Any]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mme_vla.envs.metadata import FURTHER_SPLITS
-from mme_vla.errors import UserError, did_you_mean, raise_if
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
@@ -229,13 +229,11 @@ def aggregate(
     if split is None and len(splits) > 1:
         raise UserError(f"These are results of several splits ({', '.join(splits)}): choose one with --split.")
     selected = [r for r in merged if split in (None, r.split)]
-    raise_if(
-        not selected, f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}."
-    )
+    require(selected, f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}.")
     inside = [r for r in selected if protocol.expects(r.key)]
     counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
-    raise_if(
-        not counted,
+    require(
+        counted,
         f"None of the {len(selected)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1}).",
     )
     _check_environments(counted)
@@ -367,8 +365,8 @@ def _check_environments(records: Sequence[EpisodeRecord]) -> None:
     seeds: dict[EpisodeKey, EpisodeRecord] = {}
     for record in records:
         first = seeds.setdefault(record.key, record)
-        raise_if(
-            (first.seed, first.difficulty) != (record.seed, record.difficulty),
+        require(
+            (first.seed, first.difficulty) == (record.seed, record.difficulty),
             f"{record.task} {record.episode} has seed {first.seed} ({first.difficulty}) in {first.run}, "
             f"but {record.seed} ({record.difficulty}) in {record.run}: these are different benchmarks.",
         )

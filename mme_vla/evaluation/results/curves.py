@@ -8,7 +8,7 @@ import numpy as np
 
 from mme_vla.envs.metadata import BASE, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import Interval, Results, wilson
 from mme_vla.evaluation.results.plots import COLOURS, figure, svg
@@ -45,9 +45,7 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
         if variant is not None and variant.dial:
             at = (str(record.run._replace(split=BASE)), record.task, variant.dial)
             groups.setdefault(at, {}).setdefault(variant.turned, []).append(record)
-    raise_if(
-        not groups, "None of these records is of a stress split: evaluate with split=stress:count=2, for instance."
-    )
+    require(groups, "None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
     curves: Curves = {}
     for (run, task, dial), places in groups.items():
         baseline = [r for r in merged if r.split == BASE and r.task == task and str(r.run) == run]

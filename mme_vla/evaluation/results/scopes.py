@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 
 DIFFICULTIES = ("easy", "medium", "hard")
@@ -102,7 +102,7 @@ class Protocol:
             (self.errors in ("failure", "missing"), f"errors={self.errors!r} must be failure or missing."),
             (0 < self.confidence < 1, f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95."),
         ):  # fmt: skip
-            raise_if(not holds, message)
+            require(holds, message)
 
     def expects(self, key: EpisodeKey) -> bool:
         return key.task in self.tasks and 0 <= key.episode < self.episodes

@@ -19,7 +19,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.subtasks import Progress, process_score
-from mme_vla.errors import raise_if
+from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
@@ -218,7 +218,7 @@ MISSING = "which this environment does not deliver"
 
 
 def _require(observation: dict[str, list[Any]], name: str, message: str) -> None:
-    raise_if(f"{name}_list" not in observation, f"{message}; there are only {', '.join(sorted(observation))}.")
+    require(f"{name}_list" in observation, f"{message}; there are only {', '.join(sorted(observation))}.")
 
 
 class _Frames:

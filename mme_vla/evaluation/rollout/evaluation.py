@@ -11,7 +11,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
@@ -58,9 +58,7 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
         text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
-    raise_if(
-        not shard.index < shard.count, f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4."
-    )
+    require(shard.index < shard.count, f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
     return shard
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mme_vla.envs import metadata
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import UserError, raise_if
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.curves import EXTRA as PROCESS
 from mme_vla.evaluation.rollout.episode import RunningEpisode
@@ -169,8 +169,8 @@ class Rollout:
             if not reply.crashed:
                 running.end(reply.info)
             self._stillborn += not running.chunks
-            raise_if(
-                not self._stillborn < GIVE_UP_AFTER,
+            require(
+                self._stillborn < GIVE_UP_AFTER,
                 f"{self._stillborn} environments in a row could not be started, so the run stops; the last one: "
                 f"{reply.info.get('error_message')}",
             )
@@ -188,8 +188,8 @@ class Rollout:
     def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
         """Let the episode begin once more if images of its video are needed that it did not draw."""
         missing, length = self._render_plan.missing(reply.observation), len(reply.observation["state"]) - 1
-        raise_if(
-            running.redrawn not in (None, length),
+        require(
+            running.redrawn in (None, length),
             f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
             "again: the environment does not repeat itself. Set draw=all.",
         )
