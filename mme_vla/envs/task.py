@@ -78,8 +78,7 @@ class Task(Stage):
         self.in_view = in_view
         self.row = row
         """The scene's values, where it is not sampled from its seed."""
-        self.tier: str = (row or {}).get("tier") or ""
-        """Of RoboMME-OOD, whose rules then hold; empty for the benchmark's."""
+        self.tier = (row or {}).get("tier") or ""
         self.stress = {dial: turned for dial, turned in (stress or {}).items() if turned}
         """Dials that are turned, and how far."""
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
