@@ -64,10 +64,12 @@ def run(task: str, options: dict[str, Any]) -> dict[str, Any]:
 def jobs(split: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     """What identifies an episode, and the options of its task; round by round over the tasks."""
     if split == "ood":
-        for number in range(50):
-            for task in metadata.TASK_NAMES:
-                spec = metadata.episode(task, "ood", number)
-                yield {"task": task, "episode": number, "tier": spec.difficulty}, spec.options
+        expert = {(row["task"], int(row["episode"])) for row in read(OOD_FOLDER / "expert_steps.csv")}
+        # Those whose expert's steps are known come first.
+        order = {t: sorted(range(50), key=lambda n, t=t: (t, n) not in expert) for t in metadata.TASK_NAMES}
+        for task, number in ((task, order[task][i]) for i in range(50) for task in metadata.TASK_NAMES):
+            spec = metadata.episode(task, "ood", number)
+            yield {"task": task, "episode": number, "tier": spec.difficulty}, spec.options
     for row in sorted(read(LENGTHS), key=lambda row: int(row["episode"])):
         if split == "train":
             options = {"seed": int(row["seed"]), "difficulty": row["difficulty"], "recovery": row["recovery"] or None}

@@ -1,6 +1,6 @@
 """VideoRepick (Reference): the video picks up a cube; pick the same one up again, wherever it is now."""
 
-from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from mme_vla.envs.scene.motions import SWAP_STEPS, Cue, Swap, planned_swaps, row, sequential_swaps, tally, under
 from mme_vla.envs.scene.objects import COLOURS, RGB, Cube
@@ -10,11 +10,14 @@ from mme_vla.envs.scene.placement import (
     Region,
     rotated_anchors,
 )
-from mme_vla.envs.scene.predicates import any_picked_up, dropped, pressed
+from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, pressed
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.stages import add_button, add_cube, delay, end_video, go_home, pick, press, wait
+
+if TYPE_CHECKING:
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
@@ -146,14 +149,22 @@ class VideoRepick(Task):
         return [first, drop, *home, *swaps, end_video(self)]
 
     def _swap_wait(self, i: int) -> SubTask:
-        """Hold still for a swap; in RoboMME-OOD also until it is done."""
-        static = wait(self, SWAP_STEPS)
+        """Hold still for a swap; in RoboMME-OOD until it ends."""
+        if not self.tier:
+            return wait(self, SWAP_STEPS)
+        still = StaticFor(self, 1)
+
+        def run(demo: "Demonstrator") -> None:
+            if not self.swaps:
+                demo.hold(SWAP_STEPS)
+            while self.swaps and self.steps_done < self.swaps[i].end:
+                demo.open()
 
         def done() -> bool:
-            still = static.done()
-            return still and bool(self.swaps) and self.steps_done >= self.swaps[i].end
+            at_rest = still()
+            return at_rest and bool(self.swaps) and self.steps_done >= self.swaps[i].end
 
-        return replace(static, done=done) if self.tier else static
+        return SubTask("static", done, run, video=True)
 
     def _execution(self) -> list[SubTask]:
         stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
