@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.envs.episodes import named_tasks
+from mme_vla.envs.metadata import step_limit
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
@@ -31,6 +32,8 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
     specs = choose_episodes(named_tasks(config), config["episodes"], config["split"])
+    if config["max_steps"] is None:
+        config["max_steps"] = step_limit(config["split"])
     for name in ("max_steps", "max_choices"):
         if isinstance(config[name], bool) or not isinstance(config[name], int) or config[name] < 1:
             raise UserError(f"{name}={config[name]!r}; expected a positive integer.")

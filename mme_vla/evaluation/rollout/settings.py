@@ -7,9 +7,8 @@ from typing import Any, Self
 
 from mme_vla.config.sections import read_section
 from mme_vla.envs.make import ENVS
-from mme_vla.envs.metadata import check_split
+from mme_vla.envs.metadata import check_split, step_limit
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.evaluation.results.scopes import MAX_STEPS
 from mme_vla.evaluation.rollout.video import SAVE_ON
 
 RENDER_MODES = ("needed", "all")
@@ -20,6 +19,7 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
+    max_steps: actions until the outcome is `timeout`; 0: as many as the split allows.
     execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
@@ -33,7 +33,7 @@ class RolloutSettings:
     seed: int = 42
     split: str = "test"
     env: str = "mme_vla"
-    max_steps: int = MAX_STEPS
+    max_steps: int = 0
     execute: int | None = None
     flow_steps: int | None = None
     workers: int | None = None
@@ -55,6 +55,8 @@ class RolloutSettings:
                 raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")
         if check_split(self.split) is not None and self.env == "official":
             raise UserError(f"split={self.split} varies this library's scenes: leave out env=official.")
+        if self.max_steps == 0:
+            object.__setattr__(self, "max_steps", step_limit(self.split))
         least = {"max_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
         for name, smallest in least.items():
             self._check_integer(name, getattr(self, name), smallest)
@@ -70,7 +72,8 @@ class RolloutSettings:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read the keys of a configuration that are settings; others are ignored."""
-        return read_section(cls, config, others=True)
+        unset = config.get("max_steps", 0) is None
+        return read_section(cls, {**config, "max_steps": 0} if unset else config, others=True)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""
