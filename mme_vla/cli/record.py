@@ -185,8 +185,14 @@ def plan(cfg: "DictConfig") -> list[Job]:
     frames = _frame_choice(cfg)
     return [
         Job(
-            s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None,
-            cfg.retries if s.row is None else 1, frames, s.row,
+            s.task,
+            s.episode,
+            s.seed,
+            s.difficulty,
+            s.recovery if cfg.recovery else None,
+            cfg.retries if s.row is None else 1,
+            frames,
+            s.row,
         )
         for s in specs
     ]

@@ -53,6 +53,8 @@ SESSIONS = "sessions"
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 HARD, CHALLENGE = "hard", "challenge"
 """The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026 challenge."""
+HARD_EPISODES = 12
+"""Episodes a task has in `hard`."""
 STEPS = {CHALLENGE: 1500, OOD: 1800}
 """Control steps that a split allows, where it is not `DEFAULT_STEPS`; `ood` also means its tiers."""
 DEFAULT_STEPS = 1300
@@ -233,6 +235,13 @@ def check_split(split: str) -> Variant | None:
         known = f"{did_you_mean(str(base), [*KNOWN, TWIN, STRESS])} A file of scenes ends in .jsonl."
         raise UserError(f"Unknown split {split!r}. {known}")
     return variant
+
+
+def is_other(split: str) -> bool:
+    """Whether a split has other episodes than those that the paper's figures are about."""
+    variant = read_variant(split)
+    base = split if variant is None else variant.base
+    return base in FURTHER_SPLITS or base in (HARD, CHALLENGE) or is_row_split(base)
 
 
 def all_tasks() -> tuple[str, ...]:
