@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from itertools import islice
+from typing import Any
 
 import sapien
 
@@ -70,7 +71,7 @@ class BinFill(Task):
 
     def _given_cubes(self) -> Iterator[tuple[str, list[float]]]:
         """Colour and place of each cube of the row."""
-        names = self.values("objects.slot_assignment", list)
+        names: Any = self.values("objects.slot_assignment", list)
         count = self.values.count("layout.slots")
         if not isinstance(names, list) or len(names) != count:
             raise self.values.error("objects.slot_assignment", f"must name a cube for each of the {count} slots")

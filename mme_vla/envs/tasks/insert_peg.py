@@ -80,7 +80,8 @@ class InsertPeg(Task):
 
     def _read_pegs(self) -> list[tuple[list[float], float]]:
         """Place and yaw of each peg of the row; empty where there is none."""
-        values, pegs = self.values, []
+        values = self.values
+        pegs: list[tuple[list[float], float]] = []
         for i in range(len(self.pegs) if values.given else 0):
             entry, name = values.find("initializations.pegs")[i], f"initializations.pegs.{i}"
             if not isinstance(entry, list) or len(entry) != 2:

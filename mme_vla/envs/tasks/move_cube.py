@@ -47,10 +47,8 @@ class MoveCube(Task):
         video_peg, peg = (self._place_peg(draws, part) for part in PARTS)
         for _ in range(2):
             draws.integer(0, 2)
-        video_goal, goal = (
-            self.values.place(f"layout.{part}.goal_xy", lambda half=half: self._draw_goal(draws, half))
-            for part, half in zip(PARTS, (0.15, 0.1), strict=True)
-        )
+        video_goal = self.values.place("layout.demo.goal_xy", lambda: self._draw_goal(draws, 0.15))
+        goal = self.values.place("layout.execution.goal_xy", lambda: self._draw_goal(draws, 0.1))
         self.peg = self.add(
             build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, video_peg[:2], video_peg[2])
         )

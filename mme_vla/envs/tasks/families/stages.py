@@ -79,7 +79,7 @@ def sample_colours(env: Task, draws: Draws, order: Sequence[str]) -> list[str]:
     return env.values.words("objects.colors", list, dict.fromkeys(order))
 
 
-def check_colour(env: Task, colour: str) -> None:
+def check_colour(env: Task, colour: str | RGB) -> None:
     """Refuse a row whose `target_color`, if it has one, is not the colour that its other values give."""
     stated = env.values.find("objects.target_color")
     if stated not in (None, colour):
