@@ -54,24 +54,27 @@ class RouteStick(Task):
             colour = self.values.colour(f"layout.obstacle_rgb.{i // 2}", lambda: draws.uniforms(3).tolist())
             self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, colour))
         self.discs = self.all_discs[::2]
-        self.route = [self.discs[i] for i in self._route(draws)]
-        moves = len(self.route) - 1
-        self.directions: list[Direction] = self.values.words(
-            "actions.turns", lambda: ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)], TURNS
-        )  # type: ignore[assignment]
-        if len(self.directions) != moves:
-            raise self.values.error("actions.turns", f"has {len(self.directions)} turns for {moves} moves")
+        self._draw_route(draws)
         self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(5)]
         self._dots = Trace(self)
 
-    def _route(self, draws: Draws) -> list[int]:
-        count = len(self.discs)
-        route = self.values.indices("actions.route", lambda: self._draw_route(draws), count, distinct=False)
+    def _draw_route(self, draws: Draws) -> None:
+        """The row's route and turns, or random ones."""
+        values, count = self.values, len(self.discs)
+        route = values.indices("actions.route", lambda: self._sample_route(draws), count, distinct=False)
         if len(route) < 2 or any(abs(a - b) != 1 for a, b in itertools.pairwise(route)):
-            raise self.values.error("actions.route", f"is {route}; expected a way from disc to neighbouring disc")
-        return route
+            raise values.error("actions.route", f"is {route}; expected a way from disc to neighbouring disc")
+        moves = len(route) - 1
 
-    def _draw_route(self, draws: Draws) -> list[int]:
+        def sample() -> list[str]:
+            return ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+
+        self.route = [self.discs[i] for i in route]
+        self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
+        if len(self.directions) != moves:
+            raise values.error("actions.turns", f"has {len(self.directions)} turns for {moves} moves")
+
+    def _sample_route(self, draws: Draws) -> list[int]:
         low, high = MOVES[self.difficulty]
         moves = draws.integer(low, high + 1)
         route = [draws.integer(0, len(self.discs))]
