@@ -70,7 +70,7 @@ def jobs(split: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
         for task, number in ((task, order[task][i]) for i in range(50) for task in metadata.TASK_NAMES):
             spec = metadata.episode(task, "ood", number)
             yield {"task": task, "episode": number, "tier": spec.difficulty}, spec.options
-    for row in sorted(read(LENGTHS), key=lambda row: int(row["episode"])):
+    for row in sorted(read(LENGTHS), key=lambda row: (row["recovery"] != "", int(row["episode"]))):
         if split == "train":
             options = {"seed": int(row["seed"]), "difficulty": row["difficulty"], "recovery": row["recovery"] or None}
             yield {"task": row["task"], "episode": int(row["episode"]), "tier": row["difficulty"]}, options
