@@ -115,6 +115,7 @@ POLICIES: Registry[Any] = Registry(
         "sam2act_plus": "mme_vla.methods.sam2act.policy",
         "openvla": "mme_vla.methods.openvla_oft.policy",
         "memoryvla": "mme_vla.methods.memoryvla.policy",
+        "simplememvla": "mme_vla.methods.simplememvla.policy",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
@@ -125,6 +126,7 @@ PROCESSORS: Registry[Any] = Registry(
         "sam2act_plus": "mme_vla.methods.sam2act.processor",
         "openvla": "mme_vla.methods.openvla_oft.processor",
         "memoryvla": "mme_vla.methods.memoryvla.processor",
+        "simplememvla": "mme_vla.methods.simplememvla.processor",
     },
 )
 SUBGOALS: Registry[Any] = Registry(

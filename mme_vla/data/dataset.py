@@ -225,8 +225,14 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         window = np.arange(step.index - self.processor.samples.window + 1, step.index + 1).clip(min=0)
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
+        history, memory_camera = self.processor.samples.history, source.robot.memory_camera
+        views = {}
+        for name in cameras:
+            frames = history(step.index) if history is not None and name == memory_camera else window
+            distinct, places = np.unique(frames, return_inverse=True)
+            views[name] = source.frames(step.episode, distinct, name)[places]
         return Sample(
-            views={name: source.frames(step.episode, window, name) for name in cameras},
+            views=views,
             states=states[window - first],
             goal=source.robot.action.worded(step.goal, source.options(step.episode)),
             subgoal=subgoal,

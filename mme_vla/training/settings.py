@@ -38,6 +38,7 @@ class TrainSettings:
     weight_decay: float = 1e-10
     clip_norm: float = 1.0
     ema: float = 0.999
+    part_lr: Mapping[str, float] = field(default_factory=dict)
     optimizer: str = "adamw"
     warmup_from_zero: bool = False
     schedule: str = "constant"
@@ -85,6 +86,8 @@ class TrainSettings:
             _check(name, getattr(self, name), getattr(self, name) >= 0, "not negative")
         for name in ("lr", "eps", "clip_norm", "prefetch_gb"):
             _check(name, getattr(self, name), getattr(self, name) > 0, "positive")
+        factors = all(isinstance(x, int | float) and x > 0 for x in self.part_lr.values())
+        _check("part_lr", dict(self.part_lr), factors, "positive factors of train.lr by component, such as {vlm: 0.1}")
         _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
         betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
         _check("betas", self.betas, betas, "two numbers in [0, 1)")

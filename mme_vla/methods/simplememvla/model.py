@@ -12,9 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import missing_extra
-from mme_vla.methods.simplememvla.config import SimpleMemVlaSizes
 from mme_vla.methods.simplememvla.head import Condition
-from mme_vla.methods.simplememvla.video import TEMPORAL, pixel_rows
+from mme_vla.methods.simplememvla.video import pixel_rows
 from mme_vla.speed.recompute import Recompute, checkpoint_options
 
 try:
@@ -158,7 +157,7 @@ class VideoLanguageModel(nn.Module):
 
     def say(
         self, embedded: Tensor, positions: Tensor, ends: WordIds, limit: int, mask: Tensor | None = None,
-        prefill: Prefill | None = None,
+        prefill: Prefill | None = None, words: Sequence[Sequence[int]] | None = None,
     ) -> tuple[list[list[int]], Condition]:  # fmt: skip
         """Say the sub-tasks of prompts, greedily, and return their words' hidden states.
 
@@ -166,6 +165,7 @@ class VideoLanguageModel(nn.Module):
             embedded: [b, n, D] of the prompts, padded on the left, without what `prefill` holds.
             positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of an answer before its end.
             prefill: the beginning of one prompt; its cache is continued.
+            words: ids to say instead, without `<|im_end|>`.
 
         Returns:
             The ids of each answer up to `<|im_end|>`, and the condition, which includes the line break behind it.
@@ -177,7 +177,11 @@ class VideoLanguageModel(nn.Module):
         tails: list[list[int]] = [[] for _ in answers]  # what is fed after the words: the end and the line break
         hidden, tokens = [], []
         while any(len(tail) < 2 for tail in tails):
-            chosen = self.logits(last).argmax(-1).tolist()
+            logits = self.logits(last)
+            if words is None:
+                chosen = logits.argmax(-1).tolist()
+            else:
+                chosen = [([*said, ends.end] + [ends.newline] * len(hidden))[len(hidden)] for said in words]
             fed = []
             for answer, tail, word in zip(answers, tails, chosen, strict=True):
                 if tail or word == ends.end or len(answer) == limit:
@@ -226,8 +230,3 @@ def answer_condition(hidden: Tensor, embedded: Tensor, positions: Tensor, spans:
     rows = torch.arange(len(spans), device=hidden.device)[:, None]
     where = positions.transpose(1, 2)[rows, places].transpose(1, 2)
     return Condition(hidden[rows, places], embedded[rows, places], where, mask)
-
-
-def token_count(sizes: SimpleMemVlaSizes) -> int:
-    """Tokens of a temporal patch at the size that costs are counted at."""
-    return (sizes.image_size // sizes.factor) ** 2
