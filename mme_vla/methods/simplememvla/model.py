@@ -60,7 +60,7 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):  # type: ignore[misc]
         cache_params.update_recurrent_state(state, self.layer_idx)
         gate = self.in_proj_z(hidden_states).reshape(-1, self.head_v_dim)
         normed = self.norm(read.reshape(-1, self.head_v_dim), gate)
-        output: Tensor = self.out_proj(normed.unflatten(0, (-1, count)).flatten(2))
+        output: Tensor = self.out_proj(normed.reshape(len(hidden_states), count, -1))
         return output
 
 
