@@ -116,6 +116,7 @@ POLICIES: Registry[Any] = Registry(
         "openvla": "mme_vla.methods.openvla_oft.policy",
         "memoryvla": "mme_vla.methods.memoryvla.policy",
         "simplememvla": "mme_vla.methods.simplememvla.policy",
+        "subtask": "mme_vla.methods.simplememvla.subtask",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
@@ -127,6 +128,7 @@ PROCESSORS: Registry[Any] = Registry(
         "openvla": "mme_vla.methods.openvla_oft.processor",
         "memoryvla": "mme_vla.methods.memoryvla.processor",
         "simplememvla": "mme_vla.methods.simplememvla.processor",
+        "subtask": "mme_vla.methods.simplememvla.subtask",
     },
 )
 SUBGOALS: Registry[Any] = Registry(

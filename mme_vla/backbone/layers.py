@@ -34,9 +34,14 @@ class Rotation(NamedTuple):
 
 
 def rotation(positions: Tensor, head_dim: int) -> Rotation:
-    """Angles p·10000^(−2i/h) for positions [b, n], whole numbers or not."""
+    """Angles p·10000^(−2i/h) for positions [b, n], whole numbers or not.
+
+    Of positions [b, n, k] the angles use the coordinates in turn.
+    """
     exponent = torch.arange(head_dim // 2, device=positions.device, dtype=torch.float32) * (2 / head_dim)
-    angles = (positions[..., None, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
+    several = positions.ndim == 3
+    places = positions[..., torch.arange(head_dim // 2) % positions.shape[-1]] if several else positions[..., None]
+    angles = (places[:, :, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
     return Rotation(angles.cos(), angles.sin())
 
 

@@ -42,7 +42,7 @@ SHORT = {
     "memoryvla": [*LLAMA, "backbone.vision.image_size=28", "backbone.head.depth=1", "processor.group_size=3"],
     "sam2act_plus": ["train.warmup=1"],
     "simplememvla": [
-        "processor.image_size=32", "processor.max_words=4", "backbone.image_size=32", "backbone.head.depth=1",
+        "processor.max_words=4", "processor.seconds=4", "backbone.head.depth=1",
         "backbone.vlm.vision_config.depth=1", "backbone.vlm.text_config.num_hidden_layers=2",
         "backbone.vlm.text_config.full_attention_interval=2",
     ],

@@ -54,8 +54,8 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             "action": "",
         },
         lora_targets=(
-            "q_proj", "k_proj", "v_proj", "o_proj", "in_proj_qkv", "in_proj_z", "out_proj", "gate_proj", "up_proj",
-            "down_proj",
+            "q_proj", "k_proj", "v_proj", "o_proj", "in_proj_qkv", "in_proj_z", "linear_attn.out_proj", "gate_proj",
+            "up_proj", "down_proj",
         ),
         full_train=("action_head",),
         lora_exclude=r"^action_head\.",
@@ -359,7 +359,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         settings = PromptSettings(**{key: value for key, value in section.items() if key != "name"})
         window = Window(settings.seconds, settings.fps, settings.native_fps)
         patches = window.length // TEMPORAL if self.memory is None and settings.video else 1
-        side = settings.image_size or sizes.image_size
+        side = settings.side or sizes.image_size
         grid = (side // sizes.factor, side // sizes.factor)
         stamped = [*[TEXT] * _STAMP_TOKENS, *[VIDEO] * (grid[0] * grid[1])]
         image = [TEXT, *[IMAGE] * (grid[0] * grid[1])] * (len(robot.cameras) - 1)

@@ -66,7 +66,7 @@ class PromptSettings:
     fps: Positive = 2
     native_fps: Positive = 20
     variable: bool = True
-    image_size: PositiveInt | None = None
+    side: PositiveInt | None = None
     video_pixels: tuple[PositiveInt, PositiveInt] = (4096, 25_165_824)
     image_pixels: tuple[PositiveInt, PositiveInt] = (65_536, 16_777_216)
     max_words: Annotated[int, Range(1, 1024)] = 64
@@ -145,8 +145,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """
         self.settings, self.embodiment = settings, embodiment
         self.factor, self.memory_tokens, self.image_side = factor, memory_tokens, image_side
-        if settings.image_size is not None and settings.image_size % factor:
-            raise UserError(f"processor.image_size={settings.image_size} must be a multiple of {factor} pixels.")
+        if settings.side is not None and settings.side % factor:
+            raise UserError(f"processor.side={settings.side} must be a multiple of {factor} pixels.")
         if settings.seconds * settings.fps > 4096:
             raise UserError(f"processor.seconds={settings.seconds:g} at fps={settings.fps:g}: at most 4096 frames.")
         if embodiment.fps is not None and embodiment.fps != settings.native_fps:
@@ -203,7 +203,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         return resized(images, (self.image_side, self.image_side))
 
     def _size(self, frames: Tensor, count: int, bounds: tuple[int, int]) -> tuple[int, int]:
-        if (side := self.settings.image_size) is not None:
+        if (side := self.settings.side) is not None:
             return side, side
         height, width = frames.shape[-2:]
         return fitting_size(height, width, count, self.factor, bounds)
@@ -385,7 +385,7 @@ def _joined(parts: Sequence[Tensor]) -> Tensor:
     if len(sizes) > 1:
         raise UserError(
             f"The images of one batch have the sizes {sorted(sizes)}: videos of different lengths were shrunk "
-            "differently. Set processor.image_size."
+            "differently. Set processor.side."
         )
     return torch.cat(list(parts))
 

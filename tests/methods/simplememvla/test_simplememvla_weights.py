@@ -41,7 +41,7 @@ def test_a_published_folder_is_written_and_read_again(published: Path, tmp_path:
     tensors = load_file(published / "model.safetensors")
     assert torch.equal(tensors[LM_HEAD], tensors["backbone.model.language_model.embed_tokens.weight"])
     config = json.loads((published / "config.json").read_text())
-    assert (config["history_video_sec"], config["action_horizon"], config["native_video_fps"]) == (2, 30, 20)
+    assert (config["history_video_sec"], config["action_horizon"], config["native_video_fps"]) == (60, 30, 20)
     policy, other = tiny(1), tiny(2)
     load_weights(other, published)
     for name, tensor in policy.state_dict().items():
@@ -58,7 +58,7 @@ def test_a_folder_brings_its_window_and_sizes(published: Path, tmp_path: Path) -
     shutil.copytree(published, source)
     config = json.loads((source / "config.json").read_text())
     (source / "config.json").write_text(json.dumps(config | {"history_video_sec": 3, "robot_tag": "Two arms"}))
-    convert(source, tmp_path / "ours", ["processor=simplememvla_tiny", "backbone.image_size=64"])
+    convert(source, tmp_path / "ours", ["processor=simplememvla_tiny", "backbone.image_size=32"])
     settings = Policy.from_pretrained(tmp_path / "ours").require_processor().settings  # type: ignore[attr-defined]
     assert (settings.seconds, settings.robot) == (3, "Two arms")
     convert(tmp_path / "ours", tmp_path / "theirs", to="simplememvla")
@@ -86,8 +86,8 @@ def test_a_checkpoint_that_does_not_fit_is_refused(published: Path, tmp_path: Pa
 
     config = json.loads((published / "config.json").read_text())
     other = copy("other_window")
-    (other / "config.json").write_text(json.dumps(config | {"history_video_sec": 60}))
-    with pytest.raises(UserError, match=r"processor\.seconds=60.*this policy has 2"):
+    (other / "config.json").write_text(json.dumps(config | {"history_video_sec": 30}))
+    with pytest.raises(UserError, match=r"processor\.seconds=30.*this policy has 60"):
         load_weights(tiny(), other)
     rate = copy("other_rate")
     (rate / "config.json").write_text(json.dumps(config | {"native_video_fps": 15}))
