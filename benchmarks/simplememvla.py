@@ -1,9 +1,9 @@
 """What SimpleMemVLA costs: seconds of a decision over a long episode, FLOPs at full size, peak memory of a GPU.
 
-    python benchmarks/simplememvla.py time                  # tiny; a window of 20 s, an episode of 100 s
-    python benchmarks/simplememvla.py count                 # on the meta device, beside framesamp_modul
-    python benchmarks/simplememvla.py memory chunk          # of one GPU, or of a stand-in that computes nothing
-    python benchmarks/simplememvla.py memory update
+python benchmarks/simplememvla.py time                  # tiny; a window of 20 s, an episode of 100 s
+python benchmarks/simplememvla.py count                 # on the meta device, beside framesamp_modul
+python benchmarks/simplememvla.py memory chunk          # of one GPU, or of a stand-in that computes nothing
+python benchmarks/simplememvla.py memory update
 """
 
 import argparse
@@ -44,7 +44,9 @@ def measure_time(steps: int, every: int) -> None:
             while ahead and policy.prepare(episode):
                 pass
         seconds[ahead] = rows
-    print("| frame | decision | after reading ahead | frames kept | temporal patches kept |\n|---:|---:|---:|---:|---:|")
+    print(
+        "| frame | decision | after reading ahead | frames kept | temporal patches kept |\n|---:|---:|---:|---:|---:|"
+    )
     for (step, plain, frames, patches), (_, prepared, _, _) in zip(seconds[False], seconds[True], strict=True):
         if step % every == 0:
             print(f"| {step} | {1e3 * plain:,.0f} ms | {1e3 * prepared:,.0f} ms | {frames} | {patches} |")
@@ -65,6 +67,7 @@ def memory(what: str, recompute: bool, cudnn: bool) -> None:
     """Peak memory of a chunk (bfloat16 weights), or of two updates of one sample (AdamW over float32 weights)."""
     device = torch.device("cuda")
     torch.backends.cudnn.enabled = cudnn
+    torch.backends.cuda.enable_cudnn_sdp(cudnn)
     options: dict[str, Any] = {"policy.augment": False, "policy.compute_dtype": "bfloat16"}
     policy: Any = build_policy("simplememvla", backbone="simplememvla", device="meta", **options)
     if what == "chunk":

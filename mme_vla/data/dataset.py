@@ -93,6 +93,12 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             )
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
+        rate = processor.embodiment.fps
+        if processor.samples.history is not None and (other := [s for s in sources if rate not in (None, s.fps)]):
+            raise UserError(
+                f"{other[0].name} has {other[0].fps:g} frames per second and embodiment.fps={rate:g}: the video would "
+                "be shown at another speed than it is read at. Convert the data to that rate, or set embodiment.fps."
+            )
         self.sources, self.processor, self.memory = list(sources), processor, memory
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding

@@ -253,9 +253,9 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         described = Source("lerobot", folder).config.get("type") is not None
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
     is_ours = "backbone" in Source("ours", folder).config
-    if not is_ours and any(name.endswith("model.visual.pos_embed.weight") for name in names):
-        if METHOD_FORMATS["simplememvla"].function("matches")(names):
-            return Source("simplememvla", folder, files)
+    has_qwen = any(name.endswith("model.visual.pos_embed.weight") for name in names)
+    if not is_ours and has_qwen and METHOD_FORMATS["simplememvla"].function("matches")(names):
+        return Source("simplememvla", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
     if any(name.startswith("backbone.") for name in names) or is_ours:
         return Source("ours", folder, files)

@@ -121,9 +121,10 @@ class VideoEpisode(Episode):
         return torch.stack([self.video.patches[pair] for pair in pairs])
 
     def plan(self, step: int, tokens: Tokens, model: VideoLanguageModel) -> bool:
-        """Begin to read the prompt at a later step; return whether anything of it can be read by now."""
+        """Begin to read the prompt at a later step; return whether its beginning was observed, and rendered."""
         pairs = self.pairs(step)
-        if not tokens.prefix or pairs[-2][1] > self.step:
+        rendered = all(frame in self.video.frames for pair in pairs[:-1] for frame in pair)
+        if not tokens.prefix or not rendered:
             return False
         self.video.ahead = Ahead(step, pairs, tokens, model.new_cache())
         return True
@@ -140,7 +141,9 @@ class VideoEpisode(Episode):
         kinds = torch.from_numpy(tokens.kinds) == VIDEO
         end = int(torch.nonzero(kinds)[last * features.shape[1] - 1]) + 1
         place, device = slice(ahead.length, end), features.device
-        ids, positions = (torch.from_numpy(x[..., place].copy()).to(device)[None] for x in (tokens.ids, tokens.positions))
+        ids, positions = (
+            torch.from_numpy(x[..., place].copy()).to(device)[None] for x in (tokens.ids, tokens.positions)
+        )
         embedded = model.embed(ids, (kinds[place][None].to(device), features.flatten(0, 1)))
         model.hidden(embedded, positions, ahead.cache)
         ahead.patches, ahead.length = last, end

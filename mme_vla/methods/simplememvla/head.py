@@ -33,7 +33,7 @@ class Condition(TensorStruct):
 
 
 def scaled_section(section: tuple[int, ...], half: int) -> list[int]:
-    """Shares of the three axes in `half` angles: rounded down, the remainder to the largest fractions, first ones first."""
+    """Shares of the axes in `half` angles: rounded down, the remainder to the largest fractions, first ones first."""
     total = sum(section)
     exact = [half * share / total for share in section]
     counts = [math.floor(value) for value in exact]
@@ -44,7 +44,7 @@ def scaled_section(section: tuple[int, ...], half: int) -> list[int]:
 
 
 class Rotary(nn.Module):
-    """Rotary angles of three coordinates, interleaved: time, row, column, time, row, column, …"""
+    """Rotary angles of three coordinates, in turn: time, row, column, time and so on."""
 
     def __init__(self, head_dim: int, sizes: HeadSizes) -> None:
         super().__init__()

@@ -3,7 +3,6 @@
 Shapes: b batch · L tokens · D width · k temporal patches (pairs of frames) · m merged tokens of one.
 """
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -129,9 +128,7 @@ class VideoLanguageModel(nn.Module):
             embedded = embedded.masked_scatter(mask[..., None], tokens.to(embedded))
         return embedded
 
-    def hidden(
-        self, embedded: Tensor, positions: Tensor, cache: Any = None, mask: Tensor | None = None
-    ) -> Tensor:
+    def hidden(self, embedded: Tensor, positions: Tensor, cache: Any = None, mask: Tensor | None = None) -> Tensor:
         """Hidden states [b, L, D] after the final norm.
 
         Args:
@@ -217,7 +214,9 @@ def words_loss(model: VideoLanguageModel, hidden: Tensor, ids: Tensor, spans: Se
     return functional.cross_entropy(model.logits(hidden[row, place - 1]), ids[row, place])
 
 
-def answer_condition(hidden: Tensor, embedded: Tensor, positions: Tensor, spans: Sequence[tuple[int, int]]) -> Condition:
+def answer_condition(
+    hidden: Tensor, embedded: Tensor, positions: Tensor, spans: Sequence[tuple[int, int]]
+) -> Condition:
     """The hidden states of known answers, padded on the right to the longest.
 
     Args:

@@ -19,7 +19,7 @@ from mme_vla.memory.base import MemoryModule, full_history
 from mme_vla.methods.simplememvla.config import SimpleMemVlaSizes
 from mme_vla.methods.simplememvla.episode import VideoEpisode
 from mme_vla.methods.simplememvla.head import ActionHead, Condition
-from mme_vla.methods.simplememvla.model import Prefill, VideoLanguageModel, answer_condition, words_loss
+from mme_vla.methods.simplememvla.model import Prefill, VideoLanguageModel, WordIds, answer_condition, words_loss
 from mme_vla.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor, VideoBatch
 from mme_vla.methods.simplememvla.prompt import IMAGE, MEMORY, TEXT, VIDEO, CameraTokens, Tokens, rope_positions
 from mme_vla.methods.simplememvla.video import TEMPORAL, Window, augment, augmentation_draw
@@ -115,9 +115,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
 
     # The network
 
-    def embed(
-        self, batch: VideoBatch, memory: MemoryTokens | None = None, changes: Tensor | None = None
-    ) -> Tensor:
+    def embed(self, batch: VideoBatch, memory: MemoryTokens | None = None, changes: Tensor | None = None) -> Tensor:
         """Embeddings [b, L, D] of prompts, with images and memory tokens in them.
 
         Args:
@@ -188,9 +186,12 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The vision tower, every layer of the language model, and every block of the head."""
+        """The vision tower, every layer of the language model, and every block of the head, gathered in float32.
+
+        Decay rates of delta nets are not rounded.
+        """
         tower, layers = self.backbone.model.visual, self.backbone.model.language_model.layers
-        return [ShardGroup(tower), *map(ShardGroup, (*layers, *self.action_head.blocks))]
+        return [ShardGroup(module, full=True) for module in (tower, *layers, *self.action_head.blocks)]
 
     # Sampling
 
@@ -244,12 +245,15 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             if min(batch.prompts) < longest:
                 lengths = torch.tensor(batch.prompts, device=embedded.device)
                 mask = torch.arange(longest, device=embedded.device) >= (longest - lengths)[:, None]
-            ids, limit = self._word_settings()
+            ids, limit = self._word_settings(batch)
             return self.backbone.say(
                 torch.stack(rows)[:, start:], torch.stack(places)[..., start:], ids, limit, mask, prefill, batch.words
             )
 
-    def _word_settings(self) -> tuple[Any, int]:
+    def _word_settings(self, batch: VideoBatch) -> tuple[WordIds, int]:
+        """Ids that end an answer, and its most words; of words that are known, any."""
+        if batch.words is not None:
+            return WordIds(0, 0), max(map(len, batch.words))
         processor = self.require_processor()
         return processor.word_ids, processor.settings.max_words
 
@@ -365,7 +369,10 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         image = [TEXT, *[IMAGE] * (grid[0] * grid[1])] * (len(robot.cameras) - 1)
         memory = [MEMORY] * (0 if self.memory is None else self.memory.budget)
         kinds = np.array([TEXT, *memory, *stamped * patches, *image, *[TEXT] * (_REQUEST_TOKENS + _ANSWER_TOKENS)])
-        cameras = [CameraTokens("front", grid, [0.0] * patches), *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1)]
+        cameras = [
+            CameraTokens("front", grid, [0.0] * patches),
+            *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1),
+        ]
         length = len(kinds)
         place = {"device": device}
         return VideoBatch(
@@ -380,7 +387,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, **place),
             actions=torch.zeros(1, self.horizon, self.action_dim, **place),
             history=None if self.memory is None else full_history(self.memory, sizes.width, device),
-            words=((0,) * (_ANSWER_TOKENS - 2),),
+            words=((1,) * (_ANSWER_TOKENS - 2),),
         )
 
     def warm_up_vision(self) -> None:

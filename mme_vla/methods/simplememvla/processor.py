@@ -279,8 +279,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         tokens = self.tokens(self.prompt(sample.goal), len(video), _side(video), _side(images), answer)
         if len(tokens.ids) > self.settings.max_tokens:
             raise UserError(
-                f"A sample has {len(tokens.ids):,} tokens, more than processor.max_tokens={self.settings.max_tokens:,}: "
-                "raise it, or show a shorter video (processor.seconds, processor.fps)."
+                f"A sample has {len(tokens.ids):,} tokens, more than processor.max_tokens="
+                f"{self.settings.max_tokens:,}: raise it, or show a shorter video (processor.seconds, processor.fps)."
             )
         return {
             "tokens": tokens,
@@ -360,7 +360,10 @@ class SimpleMemVlaProcessor(PolicyProcessor):
             fingerprint = values.pop("tokenizer_fingerprint")
         except KeyError as error:
             raise UserError(f"{folder / CONFIG_FILE} lacks {error}: it is damaged, or of another version.") from None
-        if any(isinstance(value, bool) or not isinstance(value, int) for value in sizes.values()) or sizes["factor"] < 1:
+        if (
+            any(isinstance(value, bool) or not isinstance(value, int) for value in sizes.values())
+            or sizes["factor"] < 1
+        ):
             raise UserError(f"{folder / CONFIG_FILE}: factor, memory_tokens and image_side must be whole numbers.")
         if tokenizer is None:
             named = values.get("tokenizer")

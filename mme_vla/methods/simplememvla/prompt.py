@@ -7,6 +7,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -18,10 +19,11 @@ from mme_vla.methods.simplememvla.video import timestamp
 from mme_vla.processing.tokenizer import HUB
 
 if TYPE_CHECKING:
-    from tokenizers import Tokenizer
+    pass
 
-BYTES = "bytes"
+BYTES, WORDS = "bytes", "words"
 QWEN = f"{HUB}Qwen/Qwen3.5-4B/tokenizer.json"
+_WORDS_SIZE = 1000
 _LARGEST_FILE = 64 * 2**20  # bytes; Qwen's has 20 MiB
 SPECIAL = (
     "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>",
@@ -62,18 +64,18 @@ class WordTokenizer:
         """Load a tokenizer.
 
         Args:
-            spec: `bytes` (one token a byte, no file), the path of a tokenizer.json or of a folder with one, or
-                `hf://owner/repository/tokenizer.json`.
+            spec: `bytes` (one token a byte, no file), `words` (a small vocabulary of RoboMME's language, no file), the
+                path of a tokenizer.json or of a folder with one, or `hf://owner/repository/tokenizer.json`.
         """
         spec = str(spec)
-        if spec == BYTES:
-            return cls(_byte_tokenizer(), spec)
+        if spec in (BYTES, WORDS):
+            return cls(_small_tokenizer(spec), spec)
         path = _download(spec) if spec.startswith(HUB) else Path(spec).expanduser()
         path = path / "tokenizer.json" if path.is_dir() else path
         if not path.is_file():
             raise UserError(
                 f"No tokenizer at {brief(spec, 300)}. Set processor.tokenizer to the path of Qwen3.5's tokenizer.json, "
-                f"to {QWEN}, or to {BYTES!r} to try things out."
+                f"to {QWEN}, or to {BYTES!r} or {WORDS!r} to try things out."
             )
         if path.stat().st_size > _LARGEST_FILE:
             raise UserError(f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most {_LARGEST_FILE:,}.")
@@ -105,13 +107,26 @@ class WordTokenizer:
         return frozenset(self.encode("\n") + self.encode("\n\n"))
 
 
-@lru_cache(maxsize=1)
-def _byte_tokenizer() -> str:
-    """A tokenizer.json of one token a byte, two line breaks, and Qwen's special tokens."""
+@lru_cache(maxsize=2)
+def _small_tokenizer(spec: str) -> str:
+    """A tokenizer.json without any file: of one token a byte and two line breaks, or trained on RoboMME's language."""
     try:
-        from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers
+        from tokenizers import AddedToken, Tokenizer, decoders, models, pre_tokenizers, trainers
     except ImportError:
         raise missing_extra("SimpleMemVLA", "vlm") from None
+    if spec == WORDS:
+        learned: Any = Tokenizer(models.BPE())
+        learned.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+        learned.decoder = decoders.ByteLevel()
+        alphabet = pre_tokenizers.ByteLevel.alphabet()
+        corpus = files("mme_vla").joinpath("assets/tokenizer_corpus.txt").read_text(encoding="utf-8").splitlines()
+        request = instruction("", Robot("Panda single-arm robot", 20, 30), 1, 1)
+        stamps = [timestamp(place / 4) for place in range(400)]
+        trainer = trainers.BpeTrainer(vocab_size=_WORDS_SIZE, initial_alphabet=alphabet, show_progress=False)
+        learned.train_from_iterator([*corpus, *[request] * 200, *stamps, *["Front camera:\n\n"] * 200], trainer)
+        learned.add_special_tokens([AddedToken(token, normalized=False) for token in SPECIAL])
+        trained: str = learned.to_str()
+        return trained
     letters = sorted(pre_tokenizers.ByteLevel.alphabet())
     newline = "\u010a"  # how byte-level tokenizers spell a line break
     vocabulary = {letter: i for i, letter in enumerate([*letters, newline * 2])}

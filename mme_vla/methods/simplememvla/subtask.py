@@ -158,6 +158,11 @@ class SubtaskPolicy(MMEPolicy):
         """The action's loss under the recorded words, and the weighted cross entropy of these."""
         if not isinstance(batch, SubtaskBatch) or batch.words is None or batch.words_mask is None:
             raise ValueError("forward() computes a loss: the batch must hold the words of its sub-tasks.")
+        if batch.words.shape[1] > self.subtask.longest + 1:
+            raise UserError(
+                f"A sub-task has {batch.words.shape[1] - 1} words, more than policy.subtask_words="
+                f"{self.subtask.longest}: raise it."
+            )
         with self.autocast():
             hidden = self.subtask.hidden(*self._context(batch), batch.words)
             logits = self.subtask.logits(hidden[:, :-1])

@@ -288,7 +288,9 @@ def _with_features(policy: SimpleMemVlaPolicy, *episodes: Any) -> VideoBatch:
 def test_an_answer_that_reaches_the_limit_of_words(tmp_path: Path) -> None:
     golden, case = arrays("acting"), next(c for c in read("meta")["said"] if c["kind"] == "capped")
     policy = golden_policy(tmp_path, max_words=case["limit"])
-    episode = _decided(policy, {f"capped/{n}": golden[f"plain/1/{n}"] for n in ("state", "noise")}, "capped", case["current"])
+    episode = _decided(
+        policy, {f"capped/{n}": golden[f"plain/1/{n}"] for n in ("state", "noise")}, "capped", case["current"]
+    )
     actions = torch.from_numpy(policy.act(episode))
     assert episode.subtask == case["said"].strip()
     assert error(actions, golden["capped/actions"]) < TOLERANCE

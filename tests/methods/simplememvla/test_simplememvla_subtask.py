@@ -19,7 +19,7 @@ RUN = ["logger=none", "train.workers=0", "train.device=cpu", "train.log_every=1"
 
 @pytest.mark.parametrize("integration", ["modulator", "context"])
 def test_it_trains_two_updates_and_acts(integration: str, tmp_path: Path) -> None:
-    words = [*RUN, f"integration={integration}", "train.steps=2", "policy.subtask_words=4"]
+    words = [*RUN, f"integration={integration}", "train.steps=2"]
     policy = Policy.from_pretrained(run("pi05_subtask", tmp_path / "run", *words, short=[]))
     assert np.isfinite(losses(tmp_path / "run")).all() and isinstance(policy, SubtaskPolicy)
     episode = policy.start_episode("pick up the cube", seed=1)
@@ -31,12 +31,13 @@ def test_it_trains_two_updates_and_acts(integration: str, tmp_path: Path) -> Non
 def test_the_hidden_states_of_words_decide_about_actions() -> None:
     policy: Any = build_policy("pi05_subtask")
     batch, noise = policy.full_batch(), {"noise": torch.zeros(1, policy.horizon, policy.action_dim)}
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            if not parameter.any():  # gates begin at zero
+                parameter.normal_(std=0.5)
     tokens = policy.say(batch)
     assert tokens.tokens.shape[:2] == batch.said.shape
     other = MemoryTokens(tokens.tokens.flip(0, 1) + 1, tokens.mask)
-    with torch.no_grad():
-        for layer in policy.integration.layers:
-            layer.modulation.weight.normal_()
     own = policy.sample_actions(batch, noise, 2)
     assert torch.equal(own, policy.sample_actions(batch, noise, 2, memory=tokens))
     assert not torch.allclose(own, policy.sample_actions(batch, noise, 2, memory=other))
@@ -47,6 +48,12 @@ def test_words_end_at_the_limit_or_before() -> None:
     context = torch.randn(2, 5, decoder.context.in_features)
     ids, mask = decoder.say(context, torch.ones(2, 5, dtype=torch.bool), end=1)
     assert ids.shape[1] <= 4 and ids[:, -1].eq(1).logical_or(~mask[:, -1]).all()
+
+
+def test_a_sub_task_that_is_too_long_is_reported() -> None:
+    policy: Any = build_policy("pi05_subtask", policy={"subtask_words": 3})
+    with pytest.raises(UserError, match=r"11 words, more than policy\.subtask_words=3"):
+        policy(policy.full_batch())
 
 
 def test_a_memory_beside_the_words_is_refused() -> None:
