@@ -3,13 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any, Self
 
 from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, PositiveInt, Range, read_section
 from mme_vla.errors import UserError, brief, missing_extra
-
-if TYPE_CHECKING:
-    from transformers import Qwen3_5Config
 
 NAME = "simplememvla"
 LARGEST = 2**24
@@ -77,15 +74,15 @@ class SimpleMemVlaSizes:
             raise UserError(f"backbone.image_size={self.image_size} must be a multiple of {self.factor} pixels.")
 
     @cached_property
-    def qwen(self) -> "Qwen3_5Config":
-        """The vision-language model's configuration, with tied embeddings."""
+    def qwen(self) -> Any:
+        """The vision-language model's `Qwen3_5Config`, with tied embeddings."""
         try:
             from transformers import Qwen3_5Config
         except ImportError:
             raise missing_extra("SimpleMemVLA", "vlm") from None
         _check_numbers(self.vlm, "backbone.vlm")
         try:
-            config = Qwen3_5Config(**self.vlm)
+            config: Any = Qwen3_5Config(**self.vlm)
             config.tie_word_embeddings = config.text_config.tie_word_embeddings = True
             vision, text = config.vision_config, config.text_config
             fits = vision.out_hidden_size == text.hidden_size and not vision.hidden_size % vision.num_heads

@@ -6,6 +6,7 @@ n = S + 1 + h tokens of the head.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -48,13 +49,13 @@ class Rotary(nn.Module):
 
     def __init__(self, head_dim: int, sizes: HeadSizes) -> None:
         super().__init__()
-        self.half = int(head_dim * sizes.rope_factor) // 2
-        self.theta, self.section = sizes.rope_theta, scaled_section(sizes.rope_section, self.half)
+        self.count = int(head_dim * sizes.rope_factor) // 2
+        self.theta, self.section = sizes.rope_theta, scaled_section(sizes.rope_section, self.count)
 
     def forward(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions [b, 3, n] → cosines and sines [b, n, 2·half] float32."""
-        index = torch.arange(self.half, device=positions.device, dtype=torch.float32)
-        frequencies = 1.0 / self.theta ** (index / self.half)
+        """Positions [b, 3, n] → cosines and sines [b, n, r] float32."""
+        index = torch.arange(self.count, device=positions.device, dtype=torch.float32)
+        frequencies = 1.0 / self.theta ** (index / self.count)
         angles = positions.float()[..., None] * frequencies  # b 3 n half
         mixed = angles[:, 0].clone()
         for axis in (1, 2):
@@ -128,7 +129,8 @@ class TimeEmbedding(nn.Module):
         index = torch.arange(TIME_FREQUENCIES, device=time.device, dtype=torch.float32)
         frequencies = torch.exp(-math.log(10_000) * index / (TIME_FREQUENCIES - 1))
         angles = time.float()[:, None] * frequencies
-        embedded: Tensor = self.mlp(torch.cat([angles.cos(), angles.sin()], -1).to(self.mlp[0].weight.dtype))
+        first: Any = self.mlp[0]
+        embedded: Tensor = self.mlp(torch.cat([angles.cos(), angles.sin()], -1).to(first.weight.dtype))
         return embedded
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from transformers import Qwen3_5Config
 
 
-class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):  # type: ignore[misc]
+class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
     """The delta net of transformers, which continues from a cache by more than one token too.
 
     transformers before 5.11 starts such a continuation from an empty state, with padding before it.
@@ -99,7 +99,7 @@ class VideoLanguageModel(nn.Module):
 
     @property
     def embedding(self) -> nn.Embedding:
-        return self.model.language_model.embed_tokens  # type: ignore[no-any-return]
+        return self.model.language_model.embed_tokens
 
     def recompute(self, mode: Recompute) -> None:
         """Compute layers again in the backward pass instead of keeping their activations, or keep them."""
@@ -115,7 +115,7 @@ class VideoLanguageModel(nn.Module):
         height, width = (side // vision.patch_size for side in pairs.shape[-2:])
         grid = torch.tensor([[len(pairs), height, width]])  # on the CPU: transformers reads it as numbers
         tokens = self.model.visual(rows.to(self.embedding.weight.dtype), grid_thw=grid).pooler_output
-        return tokens.reshape(len(pairs), -1, tokens.shape[-1])  # type: ignore[no-any-return]
+        return tokens.reshape(len(pairs), -1, tokens.shape[-1])
 
     def embed(self, ids: Tensor, *replaced: tuple[Tensor, Tensor]) -> Tensor:
         """Embeddings [b, L, D] of tokens [b, L], some replaced.
@@ -144,7 +144,8 @@ class VideoLanguageModel(nn.Module):
 
     def new_cache(self) -> Any:
         """An empty cache of the language model."""
-        return DynamicCache(config=self.model.config.text_config)
+        config: Any = self.model.config.text_config
+        return DynamicCache(config=config)
 
     def logits(self, hidden: Tensor) -> Tensor:
         """Logits [..., vocabulary] float32 of hidden states [..., D]."""
@@ -172,7 +173,8 @@ class VideoLanguageModel(nn.Module):
         place = positions[:, :, -1].amax(1)
         answers: list[list[int]] = [[] for _ in range(len(embedded))]
         tails: list[list[int]] = [[] for _ in answers]  # what is fed after the words: the end and the line break
-        hidden, tokens = [], []
+        hidden: list[Tensor] = []
+        tokens: list[Tensor] = []
         while any(len(tail) < 2 for tail in tails):
             logits = self.logits(last)
             if words is None:

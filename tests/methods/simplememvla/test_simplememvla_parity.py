@@ -74,7 +74,7 @@ def test_token_layouts() -> None:
         cameras = [
             CameraTokens(
                 name,
-                tuple(pixels // side for pixels in meta["sizes"]["frame"]),  # type: ignore[arg-type]
+                _grid_of(meta["sizes"]["frame"], case["frames"] if name in case["history"] else 1, side),
                 window.times(case["frames"]) if name in case["history"] else None,
             )
             for name in names
@@ -85,6 +85,13 @@ def test_token_layouts() -> None:
         np.testing.assert_array_equal(tokens.ids, golden[f"{k}/input_ids"])
         np.testing.assert_array_equal(tokens.kinds, golden[f"{k}/mm_token_type_ids"])
         np.testing.assert_array_equal(np.arange(len(tokens.ids)) >= tokens.prompt, golden[f"{k}/span"])
+
+
+def _grid_of(size: list[int], count: int, side: int) -> tuple[int, int]:
+    """Merged tokens of images of this size."""
+    settings = read("meta")["processor"]
+    height, width = fitting_size(*size, count, side, (settings["min_pixels"], settings["max_pixels"]))
+    return height // side, width // side
 
 
 def test_sizes_of_images() -> None:
@@ -143,19 +150,14 @@ def test_vision_tower(policy: SimpleMemVlaPolicy) -> None:
     assert error(visual(golden["pixels"], grid_thw=golden["grid"]).pooler_output, golden["features"]) < TOLERANCE
     image = visual(golden["image_pixels"], grid_thw=golden["image_grid"]).pooler_output
     assert error(image, golden["image_features"]) < TOLERANCE
-    patch = policy.backbone.encode_patches(channels_first(frames()["front"][:2])[None])
-    alone = visual(pixel_rows(channels_first(frames()["front"][:2])[None], *_patch()), grid_thw=_grid())
-    assert torch.equal(patch.flatten(0, 1), alone.pooler_output)
+    pairs = policy.require_processor().video(channels_first(frames()["front"][:4]))
+    alone = [policy.backbone.encode_patches(pair[None])[0] for pair in pairs]
+    assert error(torch.stack(alone), policy.backbone.encode_patches(pairs)) < 1e-5
 
 
 def _patch() -> tuple[int, int]:
     settings = read("meta")["processor"]
     return settings["patch"], settings["merge"]
-
-
-def _grid() -> Tensor:
-    height, width = (side // _patch()[0] for side in read("meta")["sizes"]["frame"])
-    return torch.tensor([[1, height, width]])
 
 
 def test_head(policy: SimpleMemVlaPolicy) -> None:
@@ -171,7 +173,7 @@ def test_head(policy: SimpleMemVlaPolicy) -> None:
     assert error(head(actions, times, condition, None), golden["without_state"]) < TOLERANCE
     assert error(head(actions, times, without_tokens, state), golden["without_tokens"]) < TOLERANCE
     assert error(head(short, times, condition, state), golden["shorter"]) < TOLERANCE
-    assert error(head(actions, times, odd, state), golden["odd_positions"]) < 5e-5  # unscaled sections: 5e-4
+    assert error(head(actions, times, odd, state), golden["odd_positions"]) < TOLERANCE  # unscaled sections: 5e-4
     assert error(head.time_embed(golden["time/in"]), golden["time/out"]) < TOLERANCE
     for steps in (1, 4, 10):
         chunk = head.sample(golden["sample/noise"], condition, state, steps)
@@ -249,7 +251,7 @@ def test_gradients(policy: SimpleMemVlaPolicy) -> None:
     largest = max(norms.values())
     for name, parameter in policy.named_parameters():
         assert parameter.grad is not None, name
-        assert abs(float(parameter.grad.norm()) - norms[name]) < TOLERANCE * max(norms[name], 1e-3 * largest), name
+        assert abs(float(parameter.grad.norm()) - norms[name]) < TOLERANCE * max(norms[name], 1e-2 * largest), name
     policy.zero_grad()
 
 
