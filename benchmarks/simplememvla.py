@@ -27,7 +27,7 @@ COMPARED = ("simplememvla", "framesamp_modul")
 def measure_time(steps: int, every: int) -> None:
     """Seconds of decisions along one episode, without and with reading ahead; the latter is not in them."""
     options: dict[str, Any] = {"processor": {"seconds": SECONDS, "max_words": 4}}
-    policy = build_policy("simplememvla", **options)
+    policy: Any = build_policy("simplememvla", **options)
     policy.require_processor().stats = unit_stats(policy.embodiment)
     rng = np.random.default_rng(0)
     side, seconds = 32, {}

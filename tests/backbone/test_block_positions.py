@@ -49,7 +49,7 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
         blocks = [replace(images, positions=positions), *others]
         hidden, _ = policy.backbone.transformer(  # type: ignore[operator]
             [*blocks, policy.backbone.action_block(chunk)],  # type: ignore[operator]
-            policy.backbone.transformer.layout([*blocks, policy.backbone.action_block(chunk)], injection.visibility),  # type: ignore[operator, union-attr]
+            policy.backbone.transformer.layout([*blocks, policy.backbone.action_block(chunk)], injection.visibility),  # type: ignore[operator]
             policy.backbone.time_condition(time),  # type: ignore[operator]
             None,
         )

@@ -374,18 +374,17 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1),
         ]
         length = len(kinds)
-        place = {"device": device}
         return VideoBatch(
-            ids=torch.zeros(1, length, dtype=torch.int64, **place),
+            ids=torch.zeros(1, length, dtype=torch.int64, device=device),
             kinds=torch.from_numpy(kinds)[None].to(device),
             positions=torch.from_numpy(rope_positions(kinds, cameras))[None].to(device),
             prompts=(length - _ANSWER_TOKENS,),
             lengths=(length,),
             patches=(patches,),
-            state=torch.zeros(1, robot.state.width, **place),
-            images=torch.zeros(1, len(robot.cameras) - 1, 3, side, side, dtype=torch.uint8, **place),
-            video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, **place),
-            actions=torch.zeros(1, self.horizon, self.action_dim, **place),
+            state=torch.zeros(1, robot.state.width, device=device),
+            images=torch.zeros(1, len(robot.cameras) - 1, 3, side, side, dtype=torch.uint8, device=device),
+            video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, device=device),
+            actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             history=None if self.memory is None else full_history(self.memory, sizes.width, device),
             words=((1,) * (_ANSWER_TOKENS - 2),),
         )

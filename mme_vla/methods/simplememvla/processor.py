@@ -110,11 +110,15 @@ class VideoBatch(TensorStruct):
         chosen = np.arange(len(self.ids))[index if isinstance(index, slice) else index.cpu().numpy()].tolist()
         starts = np.cumsum([0, *self.patches])
         places = torch.tensor([p for i in chosen for p in range(starts[i], starts[i + 1])], dtype=torch.int64)
-        flat = {n: None if (x := getattr(self, n)) is None else x[places.to(x.device)] for n in ("video", "features")}
-        per_row = {name: tuple(getattr(self, name)[i] for i in chosen) for name in ("prompts", "lengths", "patches")}
+        changed: dict[str, Any] = {
+            name: None if (x := getattr(self, name)) is None else x[places.to(x.device)]
+            for name in ("video", "features")
+        }
+        for name in ("prompts", "lengths", "patches"):
+            changed[name] = tuple(getattr(self, name)[i] for i in chosen)
         words = None if self.words is None else tuple(self.words[i] for i in chosen)
         bare = replace(self, video=None, features=None)
-        return replace(bare._map(lambda x: x[index]), **flat, **per_row, words=words)
+        return replace(bare._map(lambda x: x[index]), words=words, **changed)
 
 
 @PROCESSORS.register(NAME)

@@ -127,7 +127,7 @@ def configured(cfg: DictConfig, config: Mapping[str, Any], folder: Path) -> Dict
     if not config or "backbone_config" not in config:
         return cfg
     with open_dict(cfg):
-        cfg.backbone = OmegaConf.merge(cfg.backbone, {**backbone_section(config), "vlm": None})
+        cfg.backbone = OmegaConf.merge(cfg.backbone, backbone_section(config) | {"vlm": None})
         cfg.backbone.vlm = dict(config["backbone_config"])
         cfg.processor = OmegaConf.merge(cfg.processor, processor_section(config))
         cfg.embodiment.action.horizon = config["action_horizon"]
@@ -229,7 +229,7 @@ def write_simplememvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: 
     save_file(tensors, folder / WEIGHTS, metadata={"format": "pt"})
     (folder / CONFIG).write_text(json.dumps(published_config(target), indent=2) + "\n")
     if target.processor is not None:
-        (folder / TOKENIZER_FILE).write_text(target.processor.tokenizer.content, encoding="utf-8")
+        (folder / TOKENIZER_FILE).write_text(target.require_processor().tokenizer.content, encoding="utf-8")
     elif (tokenizer := Path(str(target.config["processor"].get("tokenizer", "")))).is_file():
         shutil.copyfile(tokenizer, folder / TOKENIZER_FILE)
     if stats is not None:

@@ -151,7 +151,7 @@ def test_without_video_the_past_does_not_count() -> None:
         episode = policy.start_episode("pick up the cube", seed=1)
         observe(episode, frames, states, 0, 30)
         chunks.append(policy.act(episode))
-    np.testing.assert_array_equal(*chunks)
+    np.testing.assert_array_equal(chunks[0], chunks[1])
     assert len(policy.frames_read(np.arange(30), 0)) == 0 and not policy.prepare(episode)
 
 
@@ -196,7 +196,7 @@ def test_a_memory_of_the_paper_in_the_videos_place(memory: str, tmp_path: Path) 
         episode = policy.start_episode("pick up the cube", seed=1)
         observe(episode, frames, states, 0, 6)
         chunks.append(policy.act(episode, 2))
-    assert not np.array_equal(*chunks)
+    assert not np.array_equal(chunks[0], chunks[1])
 
 
 def test_lora_trains_adapters_of_the_language_model_and_the_head() -> None:
@@ -249,5 +249,5 @@ def test_a_policy_comes_back_from_its_folder(tmp_path: Path) -> None:
         episode = loaded.start_episode("pick up the cube", seed=1)
         observe(episode, views, states, 0, 25)
         chunks.append(loaded.act(episode))
-    np.testing.assert_array_equal(*chunks)
+    np.testing.assert_array_equal(chunks[0], chunks[1])
     assert policy.require_processor().frames(24).size % TEMPORAL == 0

@@ -44,7 +44,7 @@ def test_the_hidden_states_of_words_decide_about_actions() -> None:
 
 
 def test_words_end_at_the_limit_or_before() -> None:
-    decoder: Any = build_policy("pi05_subtask", policy={"subtask_words": 3}).subtask  # type: ignore[attr-defined]
+    decoder: Any = build_policy("pi05_subtask", policy={"subtask_words": 3}).subtask
     context = torch.randn(2, 5, decoder.context.in_features)
     ids, mask = decoder.say(context, torch.ones(2, 5, dtype=torch.bool), end=1)
     assert ids.shape[1] <= 4 and ids[:, -1].eq(1).logical_or(~mask[:, -1]).all()

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -22,7 +23,7 @@ from mme_vla.weights.writers import write_policy
 LM_HEAD = "backbone.lm_head.weight"
 
 
-def tiny(seed: int = 1, **options: object) -> Policy:
+def tiny(seed: int = 1, **options: Any) -> Policy:
     policy = build_policy("simplememvla", seed=seed, **options)
     policy.require_processor().stats = unit_stats(policy.embodiment)
     return policy
