@@ -34,11 +34,6 @@ def read(name: str) -> dict[str, Any]:
     return content
 
 
-def error(actual: Tensor, expected: Tensor) -> float:
-    """The largest difference, relative to the largest entry."""
-    return float((actual - expected).abs().max() / expected.abs().max())
-
-
 def robot_section(config: dict[str, Any]) -> dict[str, Any]:
     """A robot with the sizes of a case; its chunks are executed as far as the prefix of the next prompt allows."""
     window = Window(config["history_video_sec"], config["history_video_fps"], config["native_video_fps"])

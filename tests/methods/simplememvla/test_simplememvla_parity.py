@@ -11,7 +11,8 @@ from torch import Tensor
 
 pytest.importorskip("transformers", reason="needs the extra `vlm`: uv sync --inexact --extra vlm")
 
-from helpers.simplememvla_golden import arrays, error, folder, frames, golden_policy, read, sections
+from helpers.baselines import relative_error as error
+from helpers.simplememvla_golden import arrays, folder, frames, golden_policy, read, sections
 from mme_vla.methods.simplememvla.head import Condition, channel_loss, scaled_section
 from mme_vla.methods.simplememvla.model import answer_condition, words_loss
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy

@@ -230,6 +230,24 @@ def test_a_video_of_another_rate_is_refused() -> None:
         build_policy("simplememvla", **{**SMALL, "processor": {"native_fps": 15}})
 
 
+def test_data_of_another_rate_are_refused(tmp_path: Path) -> None:
+    words = [*WORDS, *RUN, "embodiment.fps=10", "train.steps=1", "train.batch_size=1"]
+    with pytest.raises(UserError, match=r"20 frames per second and embodiment\.fps=10"):
+        run("simplememvla", tmp_path / "run", *words, short=[])
+
+
+def test_it_acts_in_bfloat16(tmp_path: Path) -> None:
+    small().save_pretrained(tmp_path / "saved")
+    policy = Policy.from_pretrained(tmp_path / "saved", dtype="bfloat16")
+    views, states = observations(70)
+    episode = policy.start_episode("pick up the cube", seed=1)
+    observe(episode, views, states, 0, 50)
+    assert np.isfinite(policy.act(episode)).all()
+    policy.prepare(episode)  # type: ignore[operator]
+    observe(episode, views, states, 50, 66)
+    assert np.isfinite(policy.act(episode)).all()
+
+
 def test_inspect_names_its_parts(tmp_path: Path) -> None:
     policy = small()
     policy.save_pretrained(tmp_path / "saved")
