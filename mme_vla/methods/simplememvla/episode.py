@@ -76,7 +76,7 @@ class VideoEpisode(Episode):
         super().__init__(policy, goal, seed)
         self.video = VideoMemory()
         self.subtask = ""
-        """What the policy said at its last chunk."""
+        """The sub-task that the policy generated for its last chunk."""
 
     def _take(
         self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None

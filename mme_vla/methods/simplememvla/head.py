@@ -66,12 +66,12 @@ class Rotary(nn.Module):
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-    """Turn the first numbers of each head [b, heads, n, k] by angles [b, n, r]; the others stay."""
+    """Rotate the first numbers of each head [b, heads, n, k] by angles [b, n, r]; the others stay."""
     width = cos.shape[-1]
-    turned, fixed = x[..., :width], x[..., width:]
-    first, second = turned.chunk(2, -1)
+    rotary, remaining = x[..., :width], x[..., width:]
+    first, second = rotary.chunk(2, -1)
     cos, sin = (value[:, None].to(x.dtype) for value in (cos, sin))
-    return torch.cat([turned * cos + torch.cat([-second, first], -1) * sin, fixed], -1)
+    return torch.cat([rotary * cos + torch.cat([-second, first], -1) * sin, remaining], -1)
 
 
 class Attention(nn.Module):

@@ -1,4 +1,4 @@
-"""The vision-language model of SimpleMemVLA: transformers' Qwen3.5, its hidden states, and the words it says.
+"""The vision-language model of SimpleMemVLA: transformers' Qwen3.5, its hidden states, and the words it generates.
 
 Shapes: b batch · L tokens · D width · k temporal patches (pairs of frames) · m merged tokens of one.
 """
@@ -153,17 +153,17 @@ class VideoLanguageModel(nn.Module):
 
     # Words
 
-    def say(
+    def generate(
         self, embedded: Tensor, positions: Tensor, ends: WordIds, limit: int, mask: Tensor | None = None,
         prefill: Prefill | None = None, words: Sequence[Sequence[int]] | None = None,
     ) -> tuple[list[list[int]], Condition]:  # fmt: skip
-        """Say the sub-tasks of prompts, greedily, and return their words' hidden states.
+        """Generate the sub-tasks of prompts, greedily, and return their words' hidden states.
 
         Args:
             embedded: [b, n, D] of the prompts, padded on the left, without what `prefill` holds.
             positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of an answer before its end.
             prefill: the beginning of one prompt; its cache is continued.
-            words: ids to say instead, without `<|im_end|>`.
+            words: ids to take instead, without `<|im_end|>`.
 
         Returns:
             The ids of each answer up to `<|im_end|>`, and the condition, which includes the line break behind it.
@@ -172,25 +172,26 @@ class VideoLanguageModel(nn.Module):
         last = self.hidden(embedded, positions, cache, mask)[:, -1]
         place = positions[:, :, -1].amax(1)
         answers: list[list[int]] = [[] for _ in range(len(embedded))]
-        tails: list[list[int]] = [[] for _ in answers]  # what is fed after the words: the end and the line break
+        tails: list[list[int]] = [[] for _ in answers]  # what follows the words: the end and the line break
         hidden: list[Tensor] = []
         tokens: list[Tensor] = []
         while any(len(tail) < 2 for tail in tails):
             logits = self.logits(last)
             if words is None:
-                chosen = logits.argmax(-1).tolist()
+                likeliest = logits.argmax(-1).tolist()
             else:
-                chosen = [([*said, ends.end] + [ends.newline] * len(hidden))[len(hidden)] for said in words]
-            fed = []
-            for answer, tail, word in zip(answers, tails, chosen, strict=True):
+                step = len(hidden)
+                likeliest = [answer_ids[step] if step < len(answer_ids) else ends.end for answer_ids in words]
+            inputs = []
+            for answer, tail, word in zip(answers, tails, likeliest, strict=True):
                 if tail or word == ends.end or len(answer) == limit:
                     tail.append(ends.newline if tail else ends.end)
-                    fed.append(tail[-1])
+                    inputs.append(tail[-1])
                 else:
                     answer.append(word)
-                    fed.append(word)
+                    inputs.append(word)
             place = place + 1
-            token = self.embed(torch.tensor(fed, device=embedded.device)[:, None])
+            token = self.embed(torch.tensor(inputs, device=embedded.device)[:, None])
             if mask is not None:
                 mask = functional.pad(mask, (0, 1), value=True)
             last = self.hidden(token, place[:, None, None].expand(-1, 3, 1), cache, mask)[:, -1]
@@ -205,15 +206,18 @@ class VideoLanguageModel(nn.Module):
         return [[*answer, ends.end] for answer in answers], condition
 
 
-def words_loss(model: VideoLanguageModel, hidden: Tensor, ids: Tensor, spans: Sequence[tuple[int, int]]) -> Tensor:
-    """The cross entropy of answers, averaged over all their tokens.
+def words_loss(
+    model: VideoLanguageModel, hidden: Tensor, ids: Tensor, spans: Sequence[tuple[int, int]]
+) -> tuple[Tensor, Tensor]:
+    """The cross entropy of answers, averaged over all their tokens, and the share of tokens that are the likeliest.
 
     Args:
         hidden: [b, L, D]. ids: [b, L]. spans: first token of each answer, and the one behind its last.
     """
     rows = [(i, place) for i, (start, end) in enumerate(spans) for place in range(start, end)]
     row, place = torch.tensor(rows, device=hidden.device).T
-    return functional.cross_entropy(model.logits(hidden[row, place - 1]), ids[row, place])
+    logits, targets = model.logits(hidden[row, place - 1]), ids[row, place]
+    return functional.cross_entropy(logits, targets), (logits.detach().argmax(-1) == targets).float().mean()
 
 
 def answer_condition(

@@ -1,4 +1,4 @@
-"""`SimpleMemVlaPolicy`: a video-language model says the current sub-task; its words' hidden states condition a flow."""
+"""`SimpleMemVlaPolicy`: a video-language model generates the sub-task; its words' hidden states condition a flow."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -170,14 +170,15 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         with self.autocast():
             embedded = self.embed(batch, memory, changes)
             hidden = self.backbone.hidden(embedded, batch.positions)
-            words = words_loss(self.backbone, hidden, batch.ids, batch.spans)
+            words, right = words_loss(self.backbone, hidden, batch.ids, batch.spans)
             condition = answer_condition(hidden, embedded, batch.positions, batch.spans)
             action = self.action_head.loss(
                 batch.actions, condition, self._state(batch), values["noise"], values["time"], batch.action_mask
             )
         loss = self.sizes.action_weight * action + self.sizes.words_weight * words
         reported = {} if memory is None else {f"memory/{name}": value for name, value in memory.metrics.items()}
-        return loss, {"loss": loss.detach(), "action": action.detach(), "words": words.detach(), **reported}
+        metrics = {"loss": loss.detach(), "action": action.detach(), "words": words.detach(), "words_right": right}
+        return loss, metrics | reported
 
     def _state(self, batch: VideoBatch) -> Tensor | None:
         return batch.state if self.sizes.state_dim else None
@@ -207,7 +208,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
-        """A normalised chunk [b, h, a] under words that the policy says itself; answers in the batch are not read.
+        """A normalised chunk [b, h, a] under words that the policy generates; answers in the batch are not read.
 
         Args:
             memory: memory tokens encoded beforehand.
@@ -215,7 +216,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         if noise is None:
             noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.ids))])
         memory = self.encode_memory(batch.history) if memory is None else memory
-        _, condition = self.say(batch, memory)
+        _, condition = self.generate(batch, memory)
         return self._sample(batch, condition, noise, steps)
 
     def _sample(
@@ -226,10 +227,10 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             return self.action_head.sample(start, condition, self._state(batch), steps or self.sample_steps)
 
     @torch.no_grad()
-    def say(
+    def generate(
         self, batch: VideoBatch, memory: MemoryTokens | None = None, prefill: Prefill | None = None
     ) -> tuple[list[list[int]], Condition]:
-        """The ids of the sub-tasks that the policy says, and their hidden states.
+        """The ids of the sub-tasks that the policy generates, and their hidden states.
 
         Args:
             prefill: the beginning of the one prompt of the batch.
@@ -246,7 +247,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
                 lengths = torch.tensor(batch.prompts, device=embedded.device)
                 mask = torch.arange(longest, device=embedded.device) >= (longest - lengths)[:, None]
             ids, limit = self._word_settings(batch)
-            return self.backbone.say(
+            return self.backbone.generate(
                 torch.stack(rows)[:, start:], torch.stack(places)[..., start:], ids, limit, mask, prefill, batch.words
             )
 
@@ -297,10 +298,10 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             index = torch.tensor(group)
             here = index.to(self.device)
             part = replace(batch.rows(here), features=torch.cat([features[i] for i in group]))
-            said, condition = self.say(part, None if memory is None else memory.rows(here), prefills[group[0]])
+            answers, condition = self.generate(part, None if memory is None else memory.rows(here), prefills[group[0]])
             chunk = self._sample(part, condition, {"noise": noise["noise"][index]}, steps)
             chunks |= dict(zip(group, chunk, strict=True))
-            for i, words in zip(group, said, strict=True):
+            for i, words in zip(group, answers, strict=True):
                 running[i].subtask = self.require_processor().tokenizer.decode(words).strip()
         return torch.stack([chunks[i] for i in range(len(running))])
 

@@ -82,7 +82,7 @@ class VideoBatch(TensorStruct):
     video: [K, 2, 3, H, W] uint8, the temporal patches of all rows one after the other; None where `features` are given.
     features: [K, m, D], their tokens. images: [b, c, 3, H, W] uint8, of the cameras without a past.
     state: [b, s] normalised. actions: [b, h, a] normalised. action_mask: [b, h] bool. history: of a memory.
-    words: ids that each row says instead of its own, up to `<|im_end|>`; None to generate them.
+    words: ids that each row takes instead of generated ones, up to `<|im_end|>`; None to generate them.
     """
 
     ids: Tensor
@@ -107,16 +107,16 @@ class VideoBatch(TensorStruct):
 
     def rows(self, index: Tensor | slice) -> Self:
         """Rows of the batch, with the temporal patches that belong to them."""
-        chosen = np.arange(len(self.ids))[index if isinstance(index, slice) else index.cpu().numpy()].tolist()
+        indices = np.arange(len(self.ids))[index if isinstance(index, slice) else index.cpu().numpy()].tolist()
         starts = np.cumsum([0, *self.patches])
-        places = torch.tensor([p for i in chosen for p in range(starts[i], starts[i + 1])], dtype=torch.int64)
+        places = torch.tensor([p for i in indices for p in range(starts[i], starts[i + 1])], dtype=torch.int64)
         changed: dict[str, Any] = {
             name: None if (x := getattr(self, name)) is None else x[places.to(x.device)]
             for name in ("video", "features")
         }
         for name in ("prompts", "lengths", "patches"):
-            changed[name] = tuple(getattr(self, name)[i] for i in chosen)
-        words = None if self.words is None else tuple(self.words[i] for i in chosen)
+            changed[name] = tuple(getattr(self, name)[i] for i in indices)
+        words = None if self.words is None else tuple(self.words[i] for i in indices)
         bare = replace(self, video=None, features=None)
         return replace(bare._map(lambda x: x[index]), words=words, **changed)
 
@@ -184,7 +184,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
 
     @property
     def shows_video(self) -> bool:
-        """Whether the past is shown; else a memory may stand for it."""
+        """Whether prompts have a video of the past; else a memory may be in its place."""
         return self.settings.video and not self.memory_tokens
 
     def frames(self, step: int) -> np.ndarray:
@@ -272,7 +272,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """One step: its prompt with the sub-task as the answer, images, state and chunk."""
         if sample.subgoal is None:
             raise UserError(
-                "SimpleMemVLA learns to say the current sub-task: set subgoal_text.kind to simple_subgoal or "
+                "SimpleMemVLA learns to generate the current sub-task: set subgoal_text.kind to simple_subgoal or "
                 "grounded_subgoal."
             )
         robot, state = self.embodiment, torch.from_numpy(sample.states[-1])

@@ -142,8 +142,8 @@ def _download(spec: str) -> Path:
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
 
-    owner, _, rest = spec.removeprefix(HUB).partition("/")
-    repository, _, file = rest.partition("/")
+    owner, _, remainder = spec.removeprefix(HUB).partition("/")
+    repository, _, file = remainder.partition("/")
     try:
         return Path(hf_hub_download(f"{owner}/{repository}", file))
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError, ValueError) as error:
@@ -242,8 +242,8 @@ def encode(
     Args:
         cameras: in the order in which they are shown. request: of `instruction`. answer: of `clean_answer`.
     """
-    shown = "".join(camera.expanded for camera in cameras)
-    text = f"<|im_start|>user\n{shown}{request}<|im_end|>\n<|im_start|>assistant\n<think>\n\n</think>\n\n"
+    views = "".join(camera.expanded for camera in cameras)
+    text = f"<|im_start|>user\n{views}{request}<|im_end|>\n<|im_start|>assistant\n<think>\n\n</think>\n\n"
     if answer is not None:
         text += f"{answer}<|im_end|>\n"
     ids = np.array(tokenizer.encode(text), np.int64)

@@ -1,7 +1,7 @@
-"""The other half of SimpleMemVLA without its video: π0.5 that says the current sub-task, and acts on its own words.
+"""The other half of SimpleMemVLA without its video: π0.5 that generates the current sub-task, and acts on its words.
 
-A small decoder reads the embeddings of current images and prompt, says the sub-task, and hands the hidden states of
-its words to the action expert as memory tokens, through any integration. The parts are of this library, not of the
+A small decoder reads the embeddings of current images and prompt and generates the sub-task. The hidden states of its
+words are memory tokens for the action expert, through any integration. The parts are of this library, not of the
 authors.
 
 Shapes: b batch · n tokens of images and prompt · S words · d width of memory tokens.
@@ -34,12 +34,12 @@ _COUNTED_WORDS = 12
 class SubtaskBatch(Batch):
     """A batch with the sub-tasks that are learned.
 
-    words: [b, S] ids, the last one ends a text. words_mask: [b, S] bool. said: ids [b, S] to say instead of own ones.
+    words: [b, S] ids, the last one ends a text. words_mask: [b, S] bool. forced: ids [b, S] in place of generated ones.
     """
 
     words: Tensor | None = None
     words_mask: Tensor | None = None
-    said: Tensor | None = None
+    forced: Tensor | None = None
 
 
 @PROCESSORS.register("subtask")
@@ -52,7 +52,7 @@ class SubtaskProcessor(Processor):
 
     def item(self, sample: Sample) -> dict[str, Any]:
         if sample.subgoal is None:
-            raise UserError("This policy learns to say the sub-task: set subgoal_text.kind to simple_subgoal.")
+            raise UserError("This policy learns to generate the sub-task: set subgoal_text.kind to simple_subgoal.")
         words = [*self.tokenizer.encode(clean_answer(sample.subgoal), bos=False), self.tokenizer.end]
         return {**super().item(sample), "words": torch.tensor(words)}
 
@@ -68,7 +68,7 @@ class SubtaskProcessor(Processor):
 
 
 class SubtaskDecoder(nn.Module):
-    """Says a sub-task word by word, and gives the hidden state of each word.
+    """Generates a sub-task word by word, and returns the hidden state of each word.
 
     Args:
         context_width: of the tokens it reads. width: d. longest: most words.
@@ -106,7 +106,7 @@ class SubtaskDecoder(nn.Module):
         return functional.linear(hidden, self.words.weight.to(hidden.dtype)).float()
 
     @torch.no_grad()
-    def say(self, context: Tensor, mask: Tensor, end: int) -> tuple[Tensor, Tensor]:
+    def generate(self, context: Tensor, mask: Tensor, end: int) -> tuple[Tensor, Tensor]:
         """The likeliest words [b, S], each row up to `end`, and their mask [b, S]."""
         ids = torch.zeros(len(context), 0, dtype=torch.int64, device=context.device)
         ended = torch.zeros(len(context), dtype=torch.bool, device=context.device)
@@ -122,7 +122,7 @@ class SubtaskDecoder(nn.Module):
 
 @POLICIES.register("subtask")
 class SubtaskPolicy(MMEPolicy):
-    """A backbone and an integration that reads the words which the policy says, in a memory's place."""
+    """A backbone and an integration that reads the words which the policy generates, in a memory's place."""
 
     def __init__(
         self, *parts: Any, subtask_depth: int = 2, subtask_heads: int = 4, subtask_words: int = 24,
@@ -174,20 +174,20 @@ class SubtaskPolicy(MMEPolicy):
 
     @torch.no_grad()
     def sample_actions(self, batch: Batch, *args: Any, **options: Any) -> Tensor:
-        """A chunk under the words that the policy says itself; arguments as for `MMEPolicy`."""
+        """A chunk under the words that the policy generates; arguments as for `MMEPolicy`."""
         if options.get("memory") is None:
-            options["memory"] = self.say(batch)
+            options["memory"] = self.generate(batch)
         return super().sample_actions(batch, *args, **options)
 
     @torch.no_grad()
-    def say(self, batch: Batch) -> MemoryTokens:
-        """The hidden states of the sub-tasks that the policy says."""
+    def generate(self, batch: Batch) -> MemoryTokens:
+        """The hidden states of the sub-tasks that the policy generates."""
         with self.autocast():
             context = self._context(batch)
-            if isinstance(batch, SubtaskBatch) and batch.said is not None:
-                ids, mask = batch.said, torch.ones_like(batch.said, dtype=torch.bool)
+            if isinstance(batch, SubtaskBatch) and batch.forced is not None:
+                ids, mask = batch.forced, torch.ones_like(batch.forced, dtype=torch.bool)
             else:
-                ids, mask = self.subtask.say(*context, self._end)
+                ids, mask = self.subtask.generate(*context, self._end)
             return MemoryTokens(self.subtask.hidden(*context, ids)[:, 1:], mask)
 
     @property
@@ -206,4 +206,4 @@ class SubtaskPolicy(MMEPolicy):
     def full_batch(self, device: torch.device | str = "cpu") -> SubtaskBatch:
         words = torch.zeros(1, _COUNTED_WORDS, dtype=torch.int64, device=device)
         full = vars(super().full_batch(device))
-        return SubtaskBatch(**full, words=words, words_mask=torch.ones_like(words, dtype=torch.bool), said=words)
+        return SubtaskBatch(**full, words=words, words_mask=torch.ones_like(words, dtype=torch.bool), forced=words)

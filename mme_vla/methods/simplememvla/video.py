@@ -55,7 +55,7 @@ class Window:
         """Camera frames before the current one that a full window reaches back."""
         return (self.length - 1) * self.stride
 
-    def shown(self, available: int) -> int:
+    def frame_count(self, available: int) -> int:
         """Frames that a window shows when `available` of them exist, the current one among them."""
         if not self.variable:
             return self.length
@@ -64,7 +64,7 @@ class Window:
 
     def frames(self, step: int) -> np.ndarray:
         """The frames shown at a step, counted from the episode's first one, video included: int64 [n], ascending."""
-        count = self.shown(step // self.stride + 1)
+        count = self.frame_count(step // self.stride + 1)
         return np.maximum(step - self.stride * np.arange(count - 1, -1, -1), 0)
 
     def times(self, count: int) -> list[float]:

@@ -150,13 +150,13 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
         current = dict(target.config[section])
         for key, value in {k: v for k, v in expected.items() if k != "vlm"}.items():
             pairs = value.items() if isinstance(value, dict) else [("", value)]
-            for inner, wanted in pairs:
+            for inner, source_value in pairs:
                 has = current[key].get(inner) if inner else current.get(key)
                 name = ".".join(filter(None, (section, key, inner)))
-                if (list(has) if isinstance(has, list | tuple) else has) != wanted:
+                if (list(has) if isinstance(has, list | tuple) else has) != source_value:
                     raise UserError(
-                        f"{source} was trained with {name}={brief(wanted)}; this policy has {brief(has)}. Set "
-                        f"{name}={brief(wanted)}."
+                        f"{source} was trained with {name}={brief(source_value)}; this policy has {brief(has)}. Set "
+                        f"{name}={brief(source_value)}."
                     )
     robot = target.embodiment
     if [*config["image_keys"]] != [_IMAGE_KEY + name for name in robot.camera_names]:
@@ -211,11 +211,11 @@ def read_published_stats(folder: Path) -> NormStats | None:
 
 
 def _stats(name: str, feature: Mapping[str, Any]) -> QuantileStats:
-    kept = {key: feature[key] for key in ("mean", "std", "q01", "q99", "min", "max") if key in feature}
-    if {"mean", "std"} <= set(kept) and not {"q01", "q99"} <= set(kept):
-        mean, std = (np.asarray(kept[key], np.float64) for key in ("mean", "std"))
-        kept |= {"q01": (mean - _ONE_PERCENT * std).tolist(), "q99": (mean + _ONE_PERCENT * std).tolist()}
-    return QuantileStats.from_dict(kept, name)
+    values = {key: feature[key] for key in ("mean", "std", "q01", "q99", "min", "max") if key in feature}
+    if {"mean", "std"} <= set(values) and not {"q01", "q99"} <= set(values):
+        mean, std = (np.asarray(values[key], np.float64) for key in ("mean", "std"))
+        values |= {"q01": (mean - _ONE_PERCENT * std).tolist(), "q99": (mean + _ONE_PERCENT * std).tolist()}
+    return QuantileStats.from_dict(values, name)
 
 
 def write_simplememvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:

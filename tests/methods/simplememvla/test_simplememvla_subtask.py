@@ -1,4 +1,4 @@
-"""π0.5 with the sub-task channel: it trains, says its words, and its words decide about actions."""
+"""π0.5 with the sub-task channel: it trains, generates words, and its words decide about actions."""
 
 from pathlib import Path
 from typing import Any
@@ -35,8 +35,8 @@ def test_the_hidden_states_of_words_decide_about_actions() -> None:
         for parameter in policy.parameters():
             if not parameter.any():  # gates begin at zero
                 parameter.normal_(std=0.5)
-    tokens = policy.say(batch)
-    assert tokens.tokens.shape[:2] == batch.said.shape
+    tokens = policy.generate(batch)
+    assert tokens.tokens.shape[:2] == batch.forced.shape
     other = MemoryTokens(tokens.tokens.flip(0, 1) + 1, tokens.mask)
     own = policy.sample_actions(batch, noise, 2)
     assert torch.equal(own, policy.sample_actions(batch, noise, 2, memory=tokens))
@@ -46,7 +46,7 @@ def test_the_hidden_states_of_words_decide_about_actions() -> None:
 def test_words_end_at_the_limit_or_before() -> None:
     decoder: Any = build_policy("pi05_subtask", policy={"subtask_words": 3}).subtask
     context = torch.randn(2, 5, decoder.context.in_features)
-    ids, mask = decoder.say(context, torch.ones(2, 5, dtype=torch.bool), end=1)
+    ids, mask = decoder.generate(context, torch.ones(2, 5, dtype=torch.bool), end=1)
     assert ids.shape[1] <= 4 and ids[:, -1].eq(1).logical_or(~mask[:, -1]).all()
 
 
