@@ -1,6 +1,6 @@
 """The action head of SimpleMemVLA: a flow-matching transformer that reads the hidden states of the sub-task's words.
 
-Shapes: b batch · S words of an answer · h actions of a chunk · d width of the head · D width of the language model ·
+Shapes: b batch · S words of a response · h actions of a chunk · d width of the head · D width of the language model ·
 n = S + 1 + h tokens of the head.
 """
 

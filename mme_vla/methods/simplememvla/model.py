@@ -64,7 +64,7 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
 
 
 class WordIds(NamedTuple):
-    """What ends an answer: the id of `<|im_end|>`, and of the line break behind it."""
+    """What ends a response: the id of `<|im_end|>`, and of the line break behind it."""
 
     end: int
     newline: int
@@ -161,18 +161,18 @@ class VideoLanguageModel(nn.Module):
 
         Args:
             embedded: [b, n, D] of the prompts, padded on the left, without what `prefill` holds.
-            positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of an answer before its end.
+            positions: [b, 3, n]. mask: [b, n], False on padding. limit: most words of a response before its end.
             prefill: the beginning of one prompt; its cache is continued.
             words: ids to take instead, without `<|im_end|>`.
 
         Returns:
-            The ids of each answer up to `<|im_end|>`, and the condition, which includes the line break behind it.
+            The ids of each response up to `<|im_end|>`, and the condition, which includes the line break behind it.
         """
         cache = self.new_cache() if prefill is None else prefill.cache
         last = self.hidden(embedded, positions, cache, mask)[:, -1]
         place = positions[:, :, -1].amax(1)
-        answers: list[list[int]] = [[] for _ in range(len(embedded))]
-        tails: list[list[int]] = [[] for _ in answers]  # what follows the words: the end and the line break
+        responses: list[list[int]] = [[] for _ in range(len(embedded))]
+        tails: list[list[int]] = [[] for _ in responses]  # what follows the words: the end and the line break
         hidden: list[Tensor] = []
         tokens: list[Tensor] = []
         while any(len(tail) < 2 for tail in tails):
@@ -181,14 +181,14 @@ class VideoLanguageModel(nn.Module):
                 likeliest = logits.argmax(-1).tolist()
             else:
                 step = len(hidden)
-                likeliest = [answer_ids[step] if step < len(answer_ids) else ends.end for answer_ids in words]
+                likeliest = [word_ids[step] if step < len(word_ids) else ends.end for word_ids in words]
             inputs = []
-            for answer, tail, word in zip(answers, tails, likeliest, strict=True):
-                if tail or word == ends.end or len(answer) == limit:
+            for response, tail, word in zip(responses, tails, likeliest, strict=True):
+                if tail or word == ends.end or len(response) == limit:
                     tail.append(ends.newline if tail else ends.end)
                     inputs.append(tail[-1])
                 else:
-                    answer.append(word)
+                    response.append(word)
                     inputs.append(word)
             place = place + 1
             token = self.embed(torch.tensor(inputs, device=embedded.device)[:, None])
@@ -197,22 +197,22 @@ class VideoLanguageModel(nn.Module):
             last = self.hidden(token, place[:, None, None].expand(-1, 3, 1), cache, mask)[:, -1]
             hidden.append(last)
             tokens.append(token[:, 0])
-        lengths = torch.tensor([len(answer) + 2 for answer in answers], device=embedded.device)
+        lengths = torch.tensor([len(response) + 2 for response in responses], device=embedded.device)
         count = len(hidden)
         steps = torch.arange(count, device=embedded.device)
         first = place - count + 1
         where = (first[:, None] + steps)[:, None].expand(-1, 3, -1)
         condition = Condition(torch.stack(hidden, 1), torch.stack(tokens, 1), where, steps < lengths[:, None])
-        return [[*answer, ends.end] for answer in answers], condition
+        return [[*response, ends.end] for response in responses], condition
 
 
 def words_loss(
     model: VideoLanguageModel, hidden: Tensor, ids: Tensor, spans: Sequence[tuple[int, int]]
 ) -> tuple[Tensor, Tensor]:
-    """The cross entropy of answers, averaged over all their tokens, and the share of tokens that are the likeliest.
+    """The cross entropy of responses, averaged over all their tokens, and the share of tokens that are the likeliest.
 
     Args:
-        hidden: [b, L, D]. ids: [b, L]. spans: first token of each answer, and the one behind its last.
+        hidden: [b, L, D]. ids: [b, L]. spans: first token of each response, and the one behind its last.
     """
     rows = [(i, place) for i, (start, end) in enumerate(spans) for place in range(start, end)]
     row, place = torch.tensor(rows, device=hidden.device).T
@@ -220,10 +220,10 @@ def words_loss(
     return functional.cross_entropy(logits, targets), (logits.detach().argmax(-1) == targets).float().mean()
 
 
-def answer_condition(
+def response_condition(
     hidden: Tensor, embedded: Tensor, positions: Tensor, spans: Sequence[tuple[int, int]]
 ) -> Condition:
-    """The hidden states of known answers, padded on the right to the longest.
+    """The hidden states of known responses, padded on the right to the longest.
 
     Args:
         hidden, embedded: [b, L, D]. positions: [b, 3, L]. spans: as for `words_loss`.

@@ -19,7 +19,7 @@ from mme_vla.memory.base import MemoryModule, full_history
 from mme_vla.methods.simplememvla.config import SimpleMemVlaSizes
 from mme_vla.methods.simplememvla.episode import VideoEpisode
 from mme_vla.methods.simplememvla.head import ActionHead, Condition
-from mme_vla.methods.simplememvla.model import Prefill, VideoLanguageModel, WordIds, answer_condition, words_loss
+from mme_vla.methods.simplememvla.model import Prefill, VideoLanguageModel, WordIds, response_condition, words_loss
 from mme_vla.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor, VideoBatch
 from mme_vla.methods.simplememvla.prompt import IMAGE, MEMORY, TEXT, VIDEO, CameraTokens, Tokens, rope_positions
 from mme_vla.methods.simplememvla.video import TEMPORAL, Window, augment, augmentation_draw
@@ -34,8 +34,8 @@ from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
-_STAMP_TOKENS, _REQUEST_TOKENS, _ANSWER_TOKENS = 9, 105, 12
-"""Text tokens of a timestamp, of a prompt's remaining text and of an answer, where costs are counted."""
+_STAMP_TOKENS, _REQUEST_TOKENS, _RESPONSE_TOKENS = 9, 105, 12
+"""Text tokens of a timestamp, of a prompt's remaining text and of a response, where costs are counted."""
 
 
 @POLICIES.register("simplememvla")
@@ -157,7 +157,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         """The flow's loss and the cross entropy of the sub-task's words, weighted and added.
 
         Args:
-            batch: with answers and `actions`. noise: of `training_noise` and `augmentation_params`.
+            batch: with responses and `actions`. noise: of `training_noise` and `augmentation_params`.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
@@ -171,7 +171,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             embedded = self.embed(batch, memory, changes)
             hidden = self.backbone.hidden(embedded, batch.positions)
             words, right = words_loss(self.backbone, hidden, batch.ids, batch.spans)
-            condition = answer_condition(hidden, embedded, batch.positions, batch.spans)
+            condition = response_condition(hidden, embedded, batch.positions, batch.spans)
             action = self.action_head.loss(
                 batch.actions, condition, self._state(batch), values["noise"], values["time"], batch.action_mask
             )
@@ -208,7 +208,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
-        """A normalised chunk [b, h, a] under words that the policy generates; answers in the batch are not read.
+        """A normalised chunk [b, h, a] under words that the policy generates; responses in the batch are not read.
 
         Args:
             memory: memory tokens encoded beforehand.
@@ -252,7 +252,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             )
 
     def _word_settings(self, batch: VideoBatch) -> tuple[WordIds, int]:
-        """Ids that end an answer, and its most words; of words that are known, any."""
+        """Ids that end a response, and its most words; of words that are known, any."""
         if batch.words is not None:
             return WordIds(0, 0), max(map(len, batch.words))
         processor = self.require_processor()
@@ -298,10 +298,12 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             index = torch.tensor(group)
             here = index.to(self.device)
             part = replace(batch.rows(here), features=torch.cat([features[i] for i in group]))
-            answers, condition = self.generate(part, None if memory is None else memory.rows(here), prefills[group[0]])
+            responses, condition = self.generate(
+                part, None if memory is None else memory.rows(here), prefills[group[0]]
+            )
             chunk = self._sample(part, condition, {"noise": noise["noise"][index]}, steps)
             chunks |= dict(zip(group, chunk, strict=True))
-            for i, words in zip(group, answers, strict=True):
+            for i, words in zip(group, responses, strict=True):
                 running[i].subtask = self.require_processor().tokenizer.decode(words).strip()
         return torch.stack([chunks[i] for i in range(len(running))])
 
@@ -359,7 +361,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
     # Costs
 
     def full_batch(self, device: torch.device | str = "cpu") -> VideoBatch:
-        """A batch of one without content: a full video, or a full memory, and an answer of a usual length."""
+        """A batch of one without content: a full video, or a full memory, and a response of a usual length."""
         sizes, robot, section = self.sizes, self.embodiment, dict(self.config["processor"])
         settings = PromptSettings(**{key: value for key, value in section.items() if key != "name"})
         window = Window(settings.seconds, settings.fps, settings.native_fps)
@@ -369,7 +371,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
         stamped = [*[TEXT] * _STAMP_TOKENS, *[VIDEO] * (grid[0] * grid[1])]
         image = [TEXT, *[IMAGE] * (grid[0] * grid[1])] * (len(robot.cameras) - 1)
         memory = [MEMORY] * (0 if self.memory is None else self.memory.budget)
-        kinds = np.array([TEXT, *memory, *stamped * patches, *image, *[TEXT] * (_REQUEST_TOKENS + _ANSWER_TOKENS)])
+        kinds = np.array([TEXT, *memory, *stamped * patches, *image, *[TEXT] * (_REQUEST_TOKENS + _RESPONSE_TOKENS)])
         cameras = [
             CameraTokens("front", grid, [0.0] * patches),
             *[CameraTokens("wrist", grid)] * (len(robot.cameras) - 1),
@@ -379,7 +381,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             ids=torch.zeros(1, length, dtype=torch.int64, device=device),
             kinds=torch.from_numpy(kinds)[None].to(device),
             positions=torch.from_numpy(rope_positions(kinds, cameras))[None].to(device),
-            prompts=(length - _ANSWER_TOKENS,),
+            prompts=(length - _RESPONSE_TOKENS,),
             lengths=(length,),
             patches=(patches,),
             state=torch.zeros(1, robot.state.width, device=device),
@@ -387,7 +389,7 @@ class SimpleMemVlaPolicy(NetworkPolicy):
             video=torch.zeros(patches, TEMPORAL, 3, side, side, dtype=torch.uint8, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
             history=None if self.memory is None else full_history(self.memory, sizes.width, device),
-            words=((1,) * (_ANSWER_TOKENS - 2),),
+            words=((1,) * (_RESPONSE_TOKENS - 2),),
         )
 
     def warm_up_vision(self) -> None:

@@ -1,4 +1,4 @@
-"""What stands between raw data and SimpleMemVLA: a time-stamped video, a prompt with its answer, mean and deviation.
+"""What stands between raw data and SimpleMemVLA: a time-stamped video, a prompt with its response, mean and deviation.
 
 Shapes: b batch · L tokens · P temporal patches of a sample · K of a batch · c cameras without a past.
 """
@@ -27,7 +27,7 @@ from mme_vla.methods.simplememvla.prompt import (
     Robot,
     Tokens,
     WordTokenizer,
-    clean_answer,
+    clean_response,
     encode,
     instruction,
 )
@@ -78,7 +78,7 @@ class VideoBatch(TensorStruct):
     """Prompts with the images that are in them.
 
     ids: [b, L] padded on the right. kinds: [b, L] int8 (`prompt.TEXT`, …). positions: [b, 3, L].
-    prompts, lengths: tokens of each row's prompt, and with its answer. patches: temporal patches of each row.
+    prompts, lengths: tokens of each row's prompt, and with its response. patches: temporal patches of each row.
     video: [K, 2, 3, H, W] uint8, the temporal patches of all rows one after the other; None where `features` are given.
     features: [K, m, D], their tokens. images: [b, c, 3, H, W] uint8, of the cameras without a past.
     state: [b, s] normalised. actions: [b, h, a] normalised. action_mask: [b, h] bool. history: of a memory.
@@ -102,7 +102,7 @@ class VideoBatch(TensorStruct):
 
     @property
     def spans(self) -> list[tuple[int, int]]:
-        """First token of each answer, and the one behind its last."""
+        """First token of each response, and the one behind its last."""
         return list(zip(self.prompts, self.lengths, strict=True))
 
     def rows(self, index: Tensor | slice) -> Self:
@@ -231,13 +231,18 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         return instruction(goal, robot, 1, len(self.embodiment.cameras) - 1)
 
     def tokens(
-        self, request: str, patches: int, size: tuple[int, int], image_size: tuple[int, int], answer: str | None = None
+        self,
+        request: str,
+        patches: int,
+        size: tuple[int, int],
+        image_size: tuple[int, int],
+        response: str | None = None,
     ) -> Tokens:
         """A prompt that shows so many temporal patches.
 
         Args:
             request: of `prompt`. size, image_size: (h, w) of the video's frames and of current images.
-            answer: the sub-task that is learned.
+            response: the sub-task that is learned.
         """
         cameras = []
         for name in self.embodiment.camera_names:
@@ -246,7 +251,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
                 cameras.append(CameraTokens(name, self._grid(size), times, self.memory_tokens))
             else:
                 cameras.append(CameraTokens(name, self._grid(image_size)))
-        return encode(self.tokenizer, cameras, request, answer)
+        return encode(self.tokenizer, cameras, request, response)
 
     def _grid(self, size: tuple[int, int]) -> tuple[int, int]:
         return size[0] // self.factor, size[1] // self.factor
@@ -269,7 +274,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
     # Batches
 
     def item(self, sample: Sample) -> dict[str, Any]:
-        """One step: its prompt with the sub-task as the answer, images, state and chunk."""
+        """One step: its prompt with the sub-task as the response, images, state and chunk."""
         if sample.subgoal is None:
             raise UserError(
                 "SimpleMemVLA learns to generate the current sub-task: set subgoal_text.kind to simple_subgoal or "
@@ -279,8 +284,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         video = self.video(channels_first(sample.views[robot.memory_camera]))
         views = [sample.views[name][-1] for name in robot.camera_names if name != robot.memory_camera]
         images = self.images(views) if views else torch.zeros(0, *video.shape[2:], dtype=torch.uint8)
-        answer = clean_answer(sample.subgoal)
-        tokens = self.tokens(self.prompt(sample.goal), len(video), _side(video), _side(images), answer)
+        response = clean_response(sample.subgoal)
+        tokens = self.tokens(self.prompt(sample.goal), len(video), _side(video), _side(images), response)
         if len(tokens.ids) > self.settings.max_tokens:
             raise UserError(
                 f"A sample has {len(tokens.ids):,} tokens, more than processor.max_tokens="

@@ -1,4 +1,4 @@
-"""The prompt of SimpleMemVLA, token for token: a user's turn with time-stamped video, and the sub-task as its answer.
+"""The prompt of SimpleMemVLA, token for token: a user's turn with time-stamped video, and the sub-task as its response.
 
 Shapes: L tokens.
 """
@@ -149,7 +149,7 @@ def _download(spec: str) -> Path:
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError, ValueError) as error:
         reason = str(error).strip().splitlines()
         raise UserError(
-            f"The tokenizer {brief(spec, 300)} could not be fetched ({reason[0] if reason else 'no answer'}). Connect "
+            f"The tokenizer {brief(spec, 300)} could not be fetched ({reason[0] if reason else 'no reply'}). Connect "
             "once so that it is kept, or set processor.tokenizer to the path of a tokenizer.json."
         ) from None
 
@@ -213,17 +213,17 @@ def clean_goal(goal: str) -> str:
     return goal.strip().replace("_", " ").rstrip(". ")
 
 
-def clean_answer(subtask: str) -> str:
+def clean_response(subtask: str) -> str:
     """A sub-task as it is learned."""
     return subtask.strip().replace("_", " ")
 
 
 @dataclass(frozen=True)
 class Tokens:
-    """A prompt, and the answer where there is one.
+    """A prompt, and the response where there is one.
 
     ids: [L] int64. kinds: [L] int8, `TEXT`, `IMAGE`, `VIDEO` or `MEMORY`. positions: [3, L] int64, time, row, column.
-    prompt: tokens before the answer. prefix: tokens up to the last one of the temporal patch before the last of the
+    prompt: tokens before the response. prefix: tokens up to the last one of the temporal patch before the last of the
         first video; 0 where a prompt does not begin with two patches.
     """
 
@@ -235,17 +235,17 @@ class Tokens:
 
 
 def encode(
-    tokenizer: WordTokenizer, cameras: Sequence[CameraTokens], request: str, answer: str | None = None
+    tokenizer: WordTokenizer, cameras: Sequence[CameraTokens], request: str, response: str | None = None
 ) -> Tokens:
-    """A prompt as tokens, and behind it the answer that is learned.
+    """A prompt as tokens, and behind it the response that is learned.
 
     Args:
-        cameras: in the order in which they are shown. request: of `instruction`. answer: of `clean_answer`.
+        cameras: in the order in which they are shown. request: of `instruction`. response: of `clean_response`.
     """
     views = "".join(camera.expanded for camera in cameras)
     text = f"<|im_start|>user\n{views}{request}<|im_end|>\n<|im_start|>assistant\n<think>\n\n</think>\n\n"
-    if answer is not None:
-        text += f"{answer}<|im_end|>\n"
+    if response is not None:
+        text += f"{response}<|im_end|>\n"
     ids = np.array(tokenizer.encode(text), np.int64)
     kinds = np.zeros(len(ids), np.int8)
     kinds[ids == tokenizer.id("<|image_pad|>")] = IMAGE
@@ -259,11 +259,11 @@ def encode(
     prefix, first = 0, cameras[0]
     if first.times is not None and len(first.times) > 1:
         prefix = int(video[first.memory + (len(first.times) - 1) * first.grid[0] * first.grid[1] - 1]) + 1
-    return Tokens(ids, kinds, rope_positions(kinds, cameras), answer_start(ids, tokenizer), prefix)
+    return Tokens(ids, kinds, rope_positions(kinds, cameras), response_start(ids, tokenizer), prefix)
 
 
-def answer_start(ids: np.ndarray, tokenizer: WordTokenizer) -> int:
-    """The first token of the answer: after the last `</think>` and the line breaks that follow it."""
+def response_start(ids: np.ndarray, tokenizer: WordTokenizer) -> int:
+    """The first token of the response: after the last `</think>` and the line breaks that follow it."""
     start = int(np.flatnonzero(ids == tokenizer.id("</think>"))[-1]) + 1
     while start < len(ids) and int(ids[start]) in tokenizer.line_breaks:
         start += 1

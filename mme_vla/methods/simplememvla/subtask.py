@@ -18,7 +18,7 @@ from torch.nn import functional
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.methods.simplememvla.prompt import clean_answer
+from mme_vla.methods.simplememvla.prompt import clean_response
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import Sample
@@ -53,7 +53,7 @@ class SubtaskProcessor(Processor):
     def item(self, sample: Sample) -> dict[str, Any]:
         if sample.subgoal is None:
             raise UserError("This policy learns to generate the sub-task: set subgoal_text.kind to simple_subgoal.")
-        words = [*self.tokenizer.encode(clean_answer(sample.subgoal), bos=False), self.tokenizer.end]
+        words = [*self.tokenizer.encode(clean_response(sample.subgoal), bos=False), self.tokenizer.end]
         return {**super().item(sample), "words": torch.tensor(words)}
 
     def collate(self, items: Sequence[dict[str, Any]]) -> SubtaskBatch:

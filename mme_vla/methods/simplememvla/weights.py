@@ -96,8 +96,8 @@ def backbone_section(config: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "name": NAME,
         "vlm": dict(config["backbone_config"]),
-        "head": {ours: config[theirs] for theirs, ours in HEAD_KEYS.items()},
-        **{ours: config[theirs] for theirs, ours in BACKBONE_KEYS.items()},
+        "head": {target_key: config[source_key] for source_key, target_key in HEAD_KEYS.items()},
+        **{target_key: config[source_key] for source_key, target_key in BACKBONE_KEYS.items()},
         "state_dim": config["state_dim"] if config["use_proprio"] else 0,
     }
 
@@ -105,7 +105,7 @@ def backbone_section(config: Mapping[str, Any]) -> dict[str, Any]:
 def processor_section(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a published config.json says of our section `processor`."""
     _check_config(config)
-    return {ours: config[theirs] for theirs, ours in PROCESSOR_KEYS.items()}
+    return {target_key: config[source_key] for source_key, target_key in PROCESSOR_KEYS.items()}
 
 
 def _check_config(config: Mapping[str, Any]) -> None:
@@ -172,19 +172,19 @@ def check_config(policy: Policy, config: Mapping[str, Any], source: str) -> None
 def published_config(policy: SimpleMemVlaPolicy) -> dict[str, Any]:
     """The config.json of a policy, as its authors' code reads it."""
     sizes, robot, processor = policy.sizes, policy.embodiment, policy.config["processor"]
-    head = {theirs: getattr(sizes.head, ours) for theirs, ours in HEAD_KEYS.items()}
+    head = {source_key: getattr(sizes.head, target_key) for source_key, target_key in HEAD_KEYS.items()}
     return {
         "model_type": NAME,
         "backbone_model_name_or_path": BASE,
         "backbone_config": sizes.qwen.to_dict(),
         "hidden_size": sizes.width,
-        **{theirs: getattr(sizes, ours) for theirs, ours in BACKBONE_KEYS.items()},
+        **{source_key: getattr(sizes, target_key) for source_key, target_key in BACKBONE_KEYS.items()},
         "use_proprio": bool(sizes.state_dim),
         "state_dim": sizes.state_dim or robot.state.width,
         **{name: list(value) if isinstance(value, tuple) else value for name, value in head.items()},
         "timestep_beta_beta": 1.0,
         "freeze_backbone": False,
-        **{theirs: processor[ours] for theirs, ours in PROCESSOR_KEYS.items()},
+        **{source_key: processor[target_key] for source_key, target_key in PROCESSOR_KEYS.items()},
         "image_keys": [_IMAGE_KEY + name for name in robot.camera_names],
         "history_image_keys": [_IMAGE_KEY + robot.memory_camera],
         "subtask_key": "subtask",

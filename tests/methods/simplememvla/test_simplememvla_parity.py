@@ -14,7 +14,7 @@ pytest.importorskip("transformers", reason="needs the extra `vlm`: uv sync --ine
 from helpers.baselines import relative_error as error
 from helpers.simplememvla_golden import arrays, folder, frames, golden_policy, read, sections
 from mme_vla.methods.simplememvla.head import Condition, channel_loss, scaled_section
-from mme_vla.methods.simplememvla.model import answer_condition, words_loss
+from mme_vla.methods.simplememvla.model import response_condition, words_loss
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.processor import VideoBatch
 from mme_vla.methods.simplememvla.prompt import CameraTokens, Robot, Tokens, WordTokenizer, encode, instruction
@@ -235,7 +235,7 @@ def test_hidden_states_velocity_and_losses(policy: SimpleMemVlaPolicy) -> None:
     hidden = policy.backbone.hidden(embedded, batch.positions)
     valid = golden["batch/attention_mask"].bool()
     assert error(hidden[valid], golden["last_hidden"][valid]) < TOLERANCE
-    condition = answer_condition(hidden, embedded, batch.positions, batch.spans)
+    condition = response_condition(hidden, embedded, batch.positions, batch.spans)
     velocity = policy.action_head(
         golden["head/in/noisy_actions"], golden["head/in/timesteps"], condition, golden["batch/state"]
     )
