@@ -281,6 +281,7 @@ def test_decisions_from_images(policy: SimpleMemVlaPolicy) -> None:
         prompt = golden[f"plain/{k}/prompt_ids"].shape[1]
         assert said[0] == golden[f"plain/{k}/full_ids"][0, prompt:].tolist()
         assert error(condition.hidden, golden[f"plain/{k}/cond_hidden"]) < TOLERANCE
+        assert condition.tokens is not None
         assert error(condition.tokens, golden[f"plain/{k}/cond_token"]) < TOLERANCE
         np.testing.assert_array_equal(condition.positions.transpose(0, 1), golden[f"plain/{k}/cond_pos"])
 
@@ -320,7 +321,7 @@ def test_prompts_that_were_read_ahead(tmp_path: Path) -> None:
     """The authors' own path, and ours in its place, give what reading the whole prompt gives."""
     golden, policy = arrays("stream"), golden_policy(tmp_path, variable=False)
     views, processor, robot = frames(), policy.require_processor(), policy.embodiment
-    episode = policy.start_episode(read("meta")["sizes"]["goal"])
+    episode: Any = policy.start_episode(read("meta")["sizes"]["goal"])
     seen, k = 0, 0
     while f"{k}/frames" in golden:
         step = int(golden[f"{k}/frames"][-1])
