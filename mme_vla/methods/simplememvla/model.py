@@ -13,7 +13,7 @@ from torch.nn import functional
 from mme_vla.errors import missing_extra
 from mme_vla.methods.simplememvla.head import Condition
 from mme_vla.methods.simplememvla.video import pixel_rows
-from mme_vla.speed.recompute import Recompute, checkpoint_options
+from mme_vla.speed import Recompute, checkpoint_options
 
 try:
     from transformers import DynamicCache, Qwen3_5Model
