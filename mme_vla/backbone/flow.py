@@ -5,14 +5,16 @@
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from mme_vla.backbone.base import Injection
 from mme_vla.errors import UserError
 from mme_vla.registry import HEADS
-from mme_vla.types import Noise, Overlap
+from mme_vla.types import Batch, Noise, Overlap
 
 EULER_STEPS = 10  # as released
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
@@ -64,6 +66,12 @@ def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) 
     for index in range(steps):
         x = x - velocity(x, index).to(x.dtype) / steps
     return x
+
+
+def normal_log_density(x: Tensor, deviation: float) -> Tensor:
+    """Log-density [b] of x [b, …] under independent normal distributions of this standard deviation."""
+    x = x.flatten(1)
+    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (math.log(deviation) + 0.5 * math.log(2 * math.pi))
 
 
 Predict = Callable[[Tensor, Tensor], Tensor]
@@ -121,6 +129,34 @@ class FlowHead:
             velocity = rtc_guidance(velocity, overlap, self.times(steps, noise.device))
         return euler(noise, steps, velocity)
 
+    # Gaussian steps, whose density is known
+
+    def sample_path(self, predict: PredictAt, noise: Tensor, increments: Tensor, deviation: float) -> Tensor:
+        """Every state x_0 … x_k [b, k + 1, h, a] of k Euler steps with noise: x_{i+1} = x_i − v(x_i)/k + σ·ε_i.
+
+        Args:
+            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 is `sample` itself.
+        """
+        steps = increments.shape[1]
+        velocity, states = self.velocity(predict, steps, noise.device), [noise]
+        for index, increment in enumerate(increments.unbind(1)):
+            mean = states[-1] - velocity(states[-1], index).to(noise.dtype) / steps
+            states.append(mean + deviation * increment if deviation else mean)
+        return torch.stack(states, 1)
+
+    def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:
+        """Log-density [b] of the states [b, k + 1, h, a] that `sample_path` made: log N(x_0) + Σ log N(x_{i+1} | x_i).
+
+        Gradients reach the network's parameters, and not the states.
+        """
+        steps = path.shape[1] - 1
+        velocity, states = self.velocity(predict, steps, path.device), path.detach().unbind(1)
+        log_prob = normal_log_density(states[0], 1.0)
+        for index, (state, reached) in enumerate(pairwise(states)):
+            error = reached - state + velocity(state, index).to(path.dtype) / steps
+            log_prob = log_prob + normal_log_density(error, deviation)
+        return log_prob
+
 
 @HEADS.register("clean_flow")
 class CleanFlowHead(FlowHead):
@@ -148,6 +184,10 @@ class HasFlowHead:
     """
 
     head: FlowHead
+
+    def predictor(self, batch: Batch, injection: Injection) -> Predict:
+        """The network's output at noisy chunks [b, h, a] and flow times [b], with gradient, for one observation."""
+        raise NotImplementedError
 
     def make_head(self, config: Any) -> None:
         """Build the head that `config.head` names, for the sizes and the time distribution of `config`."""

@@ -11,7 +11,7 @@ from torch.nn import functional
 from mme_vla.backbone.attention import Block, check_backend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
-from mme_vla.backbone.flow import HasFlowHead, time_embedding
+from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, float32_linear
 from mme_vla.backbone.siglip import VisionTower
@@ -137,6 +137,9 @@ class Pi05Backbone(
         """The flow-matching loss [b, h]."""
         assert batch.actions is not None
         return self.head.loss(partial(self.velocity, injection), batch.actions, noise)
+
+    def predictor(self, batch: Batch, injection: Injection) -> Predict:
+        return partial(self.velocity, injection)
 
     def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
         """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
