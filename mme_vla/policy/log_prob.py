@@ -1,4 +1,4 @@
-"""Log-probabilities of what a flow policy sampled, for policy gradients: the sampler with Gaussian steps and its density."""
+"""Policy gradients for flow policies: a sampler with Gaussian steps, and the log-probability of what it sampled."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
