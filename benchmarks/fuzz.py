@@ -37,13 +37,21 @@ from torch import Tensor, nn
 from helpers import artefacts
 from mme_vla import MMEPolicy
 from mme_vla.cli.weights import convert as convert_weights
+from mme_vla.data.cache import VisionCache
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.envs import metadata
 from mme_vla.errors import UserError
+from mme_vla.evaluation.store import RECORDS, read_records, read_run
+from mme_vla.play.game import Option
+from mme_vla.play.vlm_players import parse_choice
 from mme_vla.policy.tensor_files import WEIGHTS, save_tensors
+from mme_vla.subgoal.text import MalformedReply, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
 from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
 from mme_vla.training.optim import EMA
 from mme_vla.training.settings import KeepRule
-from mme_vla.utils import SUMS, write_sums
+from mme_vla.utils import SUMS, read_text, write_sums
 from mme_vla.weights import load_weights, read_stats
 
 OUTCOMES = ("refused", "warned", "harmless", "untellable", "silent", "traceback", "hang", "long")
@@ -385,6 +393,99 @@ def read_released(folder: Path) -> object:
     return artefacts.digest(*_arrays(policy.state_dict()), None if stats is None else stats.to_dict())
 
 
+def read_recording(folder: Path) -> object:
+    """Every frame of every episode."""
+    read: list[object] = []
+    for ref in list_episodes(find_files([folder / artefacts.H5])):
+        with open_episode(ref) as episode:
+            read += [ref.index, ref.task, episode.goals, episode.seed, episode.difficulty, episode.exec_start]
+            for frame in episode:
+                read += [
+                    frame.front,
+                    frame.wrist,
+                    frame.state,
+                    frame.action,
+                    frame.is_demo,
+                    sorted(frame.subgoals.items()),
+                ]
+    return artefacts.digest(*read)
+
+
+def write_summed_dataset(folder: Path) -> None:
+    """The same with checksums."""
+    artefacts.write_dataset(folder)
+    write_sums(folder / "dataset")
+
+
+def read_dataset(folder: Path) -> object:
+    """Every column and image, and the checksums as `inspect` compares them."""
+    source = EpisodeSource(folder / "dataset", name="fuzzed")
+    source.verify()
+    read: list[object] = [source.fps, source.lengths, source.exec_starts, source.subgoal_names]
+    for e in range(len(source)):
+        steps = range(int(source.lengths[e]))
+        read += [source.goal(e), source.task(e), source.states(e), source.actions(e)]
+        read += [sorted(source.subgoals(e, t).items()) for t in steps]
+        read += [source.frames(e, list(steps), view) for view in source.columns]
+    return artefacts.digest(*read)
+
+
+def read_cache(folder: Path) -> object:
+    """Every token and score."""
+    source: Any = artefacts.SyntheticSource()
+    cache = VisionCache(folder / "cache", source, artefacts.expected_fingerprint())
+    read: list[object] = [cache.width]
+    for episode in range(len(source)):
+        history = cache.history(episode)
+        stored = cache.spec.stored_frames(len(history))
+        every = np.stack([np.repeat(stored, 4), np.tile(np.arange(4), len(stored))], axis=1)
+        read += [history.gather(every).view(torch.int16).numpy(), history.scores.frames, history.scores.values]
+    return artefacts.digest(*read)
+
+
+def read_logs(folder: Path) -> object:
+    """The settings and notes, and every record."""
+    run = read_run(folder)
+    return artefacts.digest(sorted(map(repr, run.items()))), tuple(map(repr, read_records(folder / RECORDS)))
+
+
+def is_shorter(valid: Any, result: Any) -> bool:
+    """A log cut after a whole line is that of a run that was stopped there: it continues with the missing episodes."""
+    return result[0] == valid[0] and result[1] == valid[1][: len(result[1])]
+
+
+ANSWERS = {
+    "subgoal.txt": "pick up the cube at <|box_start|>(250,500)<|box_end|> now",
+    "memer.json": '{"current_subtask": "open the drawer", "keyframe_positions": [1, 3]}',
+    "gemini.json": '{"reasoning": "so far", "subgoal": "press the button at <100, 250.5>"}',
+    "choice.json": '{"choice": "a", "point": [100, 900]}',
+}
+
+
+def write_replies(folder: Path) -> None:
+    """What models said."""
+    for name, text in ANSWERS.items():
+        (folder / name).write_text(text)
+
+
+def read_replies(folder: Path) -> object:
+    """What the predictors and players understand of it; they count what they cannot, and continue."""
+    replies = {name: read_text(folder / name, "an answer") for name in ANSWERS}
+    try:
+        return (
+            parse_subgoal(replies["subgoal.txt"]), parse_memer(replies["memer.json"], recent=8),
+            pixels_of_pairs(parse_gemini(replies["gemini.json"])),
+            parse_choice(replies["choice.json"], [Option("a", "pick", True)]),
+        )  # fmt: skip
+    except MalformedReply as error:
+        raise UserError(str(error)) from None
+
+
+def read_metadata(folder: Path) -> object:
+    """Every episode."""
+    return tuple(map(repr, metadata.episodes("PickXtimes", "test", folder)))
+
+
 def _always(valid: object, result: object) -> bool:
     return True
 
@@ -394,15 +495,15 @@ TARGETS = {
     "training-checkpoint": Target(write_training, read_training),
     "checkpoint-without-sums": Target(write_without_sums, read_policy, _always),
     "released-checkpoint": Target(write_released, read_released, _always),
-    "cache": Target(artefacts.write_cache, artefacts.read_cache),
-    "dataset": Target(artefacts.write_summed_dataset, artefacts.read_dataset),
-    "dataset-without-sums": Target(artefacts.write_dataset, artefacts.read_dataset, _always),
-    "hdf5": Target(artefacts.write_recording, artefacts.read_recording, _always),
-    "logs": Target(artefacts.write_logs, artefacts.read_logs, artefacts.is_shorter),
+    "cache": Target(artefacts.write_cache, read_cache),
+    "dataset": Target(write_summed_dataset, read_dataset),
+    "dataset-without-sums": Target(artefacts.write_dataset, read_dataset, _always),
+    "hdf5": Target(artefacts.write_recording, read_recording, _always),
+    "logs": Target(artefacts.write_logs, read_logs, is_shorter),
     "kept-answers": Target(artefacts.write_answers, artefacts.read_answers),
-    "answers": Target(artefacts.write_replies, artefacts.read_replies, _always),
+    "answers": Target(write_replies, read_replies, _always),
     "rows": Target(artefacts.write_rows, artefacts.read_rows),
-    "metadata": Target(artefacts.write_metadata, artefacts.read_metadata, _always),
+    "metadata": Target(artefacts.write_metadata, read_metadata, _always),
 }
 """Kind of file → how to make one and how the library reads it."""
 

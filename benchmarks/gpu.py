@@ -30,11 +30,12 @@ from timing import machine
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from mme_vla.backbone.attention import MaskLayout, Span, attend, build_mask
+from mme_vla.backbone.layers import MaskLayout, Span, attend, build_mask
 from mme_vla.integration.base import MEMORY_VISIBILITY
 
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0
 NOT_MEASURED = "not measured"
+Projections = tuple[Tensor, Tensor, Tensor]  # queries, keys, values
 
 
 def chunks(model: str, setup: Setup) -> dict[str, Any]:
@@ -86,7 +87,7 @@ def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), wi
         mask_layout, tensors, exact = _attention_case(spans, setup, width)
         mask = build_mask(mask_layout, setup.dtype, backend, compiled=False)
 
-        def both(tensors: list[Tensor] = tensors, mask: Any = mask) -> Tensor:
+        def both(tensors: Projections = tensors, mask: Any = mask) -> Tensor:
             for x in tensors:
                 x.grad = None
             output = attend(*tensors, mask)
@@ -101,19 +102,19 @@ def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), wi
     return rows
 
 
-def _attention_case(spans: Sequence[Span], setup: Setup, width: int) -> tuple[MaskLayout, list[Tensor], Tensor]:
+def _attention_case(spans: Sequence[Span], setup: Setup, width: int) -> tuple[MaskLayout, Projections, Tensor]:
     n = sum(span.length for span in spans)
     generator = torch.Generator().manual_seed(n)
     valid = (torch.rand(setup.batch, n, generator=generator) < 0.8).to(setup.device)
     mask_layout = MaskLayout.of(spans, spans, valid, MEMORY_VISIBILITY)
     sizes = [(setup.batch, n, heads, width) for heads in (8, 1, 1)]
-    sampled = [torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes]
-    q, k, v = (x.float().transpose(1, 2) for x in sampled)
+    first, second, third = (torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes)
+    q, k, v = (x.float().transpose(1, 2) for x in (first, second, third))
     logits = (q @ k.transpose(-1, -2) * width**-0.5).masked_fill(
         ~mask_layout.expand(mask_layout.visible)[:, None], -torch.inf
     )
     exact = (logits.softmax(-1) @ v).transpose(1, 2).flatten(2)
-    return mask_layout, [x.requires_grad_() for x in sampled], exact
+    return mask_layout, (first.requires_grad_(), second.requires_grad_(), third.requires_grad_()), exact
 
 
 def nan_sweep(setup: Setup, lengths: Sequence[int], width: int = 256) -> list[str]:

@@ -3,7 +3,7 @@
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -97,7 +97,7 @@ def feeding(model: str, setup: Setup, workers: int) -> dict[str, float]:
     return {"workers": workers, "waiting": waited / took, "samples_per_s": setup.rounds * setup.batch / took}
 
 
-def _batches(policy: MMEPolicy, setup: Setup, workers: int, caches: Path) -> Iterator[Batch]:
+def _batches(policy: MMEPolicy, setup: Setup, workers: int, caches: Path) -> Generator[Batch, None, None]:
     """Batches of the embedded demonstrations in random order, without end."""
     from mme_vla.data.cache_building import ensure_cache
     from mme_vla.data.dataset import TrainingDataset

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from mme_vla.errors import UserError
     from mme_vla.evaluation.api import evaluate
     from mme_vla.integration.base import Integration
-    from mme_vla.memory.base import Memory
-    from mme_vla.memory.encoder import PerceptualMemory
+    from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
     from mme_vla.memory.recurrent import RecurrentMemory
     from mme_vla.policy.base import Policy
@@ -33,74 +32,36 @@ if TYPE_CHECKING:
     __version__: str
 
 # Names are loaded on first use, so that importing the package costs nothing and needs no optional dependency.
-_HOME = {
-    "build_policy": "mme_vla.policy.build",
-    "Policy": "mme_vla.policy.base",
-    "Embodiment": "mme_vla.embodiment",
-    "MMEPolicy": "mme_vla.policy.mme",
-    "Episode": "mme_vla.policy.episode",
-    "Memory": "mme_vla.memory.base",
-    "PerceptualMemory": "mme_vla.memory.encoder",
-    "RecurrentMemory": "mme_vla.memory.recurrent",
-    "StorageSpec": "mme_vla.memory.history",
-    "History": "mme_vla.memory.history",
-    "OnlineHistory": "mme_vla.memory.history",
-    "CachedHistory": "mme_vla.memory.history",
-    "Integration": "mme_vla.integration.base",
-    "Backbone": "mme_vla.backbone.base",
-    "SubgoalPredictor": "mme_vla.subgoal.base",
-    "Task": "mme_vla.envs.task",
-    "HistoryTokens": "mme_vla.types",
-    "MemoryTokens": "mme_vla.types",
-    "Batch": "mme_vla.types",
-    "make_env": "mme_vla.envs.make",
-    "make_vec_env": "mme_vla.envs.vector.pool",
-    "evaluate": "mme_vla.evaluation.api",
-    "probe": "mme_vla.probing.run",
-    "load_weights": "mme_vla.weights.load",
-    "register": "mme_vla.registry",
-    "UserError": "mme_vla.errors",
-    "MEMORIES": "mme_vla.registry",
-    "INTEGRATIONS": "mme_vla.registry",
-    "BACKBONES": "mme_vla.registry",
-    "SUBGOALS": "mme_vla.registry",
-    "TASKS": "mme_vla.registry",
+_MODULES = {
+    "backbone.base": ["Backbone"],
+    "embodiment": ["Embodiment"],
+    "envs.make": ["make_env"],
+    "envs.task": ["Task"],
+    "envs.vector.pool": ["make_vec_env"],
+    "errors": ["UserError"],
+    "evaluation.api": ["evaluate"],
+    "integration.base": ["Integration"],
+    "memory.base": ["Memory", "PerceptualMemory"],
+    "memory.history": ["CachedHistory", "History", "OnlineHistory", "StorageSpec"],
+    "memory.recurrent": ["RecurrentMemory"],
+    "policy.base": ["Policy"],
+    "policy.build": ["build_policy"],
+    "policy.episode": ["Episode"],
+    "policy.mme": ["MMEPolicy"],
+    "probing.run": ["probe"],
+    "registry": ["BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "register"],
+    "subgoal.base": ["SubgoalPredictor"],
+    "types": ["Batch", "HistoryTokens", "MemoryTokens"],
+    "weights.load": ["load_weights"],
 }
+_HOME = {name: f"mme_vla.{module}" for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "BACKBONES",
-    "INTEGRATIONS",
-    "MEMORIES",
-    "SUBGOALS",
-    "TASKS",
-    "Backbone",
-    "Batch",
-    "CachedHistory",
-    "Embodiment",
-    "Episode",
-    "History",
-    "HistoryTokens",
-    "Integration",
-    "MMEPolicy",
-    "Memory",
-    "MemoryTokens",
-    "OnlineHistory",
-    "PerceptualMemory",
-    "Policy",
-    "RecurrentMemory",
-    "StorageSpec",
-    "SubgoalPredictor",
-    "Task",
-    "UserError",
-    "__version__",
-    "build_policy",
-    "evaluate",
-    "load_weights",
-    "make_env",
-    "make_vec_env",
-    "probe",
-    "register",
-]
+    "BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "Backbone", "Batch", "CachedHistory", "Embodiment",
+    "Episode", "History", "HistoryTokens", "Integration", "MMEPolicy", "Memory", "MemoryTokens", "OnlineHistory",
+    "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor", "Task", "UserError",
+    "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe", "register",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -8,6 +8,49 @@ class UserError(ValueError):
     """Something the user gave cannot work: the message names the value, what was expected, and what to do."""
 
 
+def require(holds: object, message: str, error: type[Exception] = UserError) -> None:
+    """Raise an error with this message unless something holds.
+
+    The message is made in either case: for checks in a hot loop, or of a value it cannot name, write `if` and `raise`.
+    """
+    if not holds:
+        raise error(message)
+
+
+def check_choice(key: str, value: object, options: Iterable[str]) -> None:
+    """Make sure that a value is one of the options of its key."""
+    known = list(options)
+    require(isinstance(value, str) and value in known, f"{key}={brief(value)}. {did_you_mean(brief(value), known)}")
+
+
+def check_sizes(section: str, **sizes: int) -> None:
+    """Make sure that numbers of a section are at least 1."""
+    for key, value in sizes.items():
+        require(value >= 1, f"{section}.{key}={value} must be at least 1.")
+
+
+LARGEST = 2**16
+"""Of any size of a robot or a processor: what is larger is a damaged file, and would take memory."""
+
+
+def check_whole(key: str, value: object, most: int = LARGEST) -> int:
+    """The value of a key, a whole number from 1 to `most`."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise UserError(f"{key} must be a positive whole number to {most}, got {brief(value)}.")
+    return value
+
+
+def check_multiple(section: str, name: str, value: int, of: str, unit: int) -> None:
+    """Make sure that a size is a multiple of another one."""
+    require(value % unit == 0, f"{section}{name}={value} must be a multiple of {of}={unit}.")
+
+
+def check_known(kind: str, value: object, known: Iterable[str]) -> None:
+    """Make sure that a name is one of those that exist, such as the name of a task."""
+    if value not in (names := list(known)):
+        raise UserError(f"Unknown {kind} {value!r}. {did_you_mean(str(value), names)}")
+
+
 def did_you_mean(name: str, options: Iterable[str]) -> str:
     """Return a sentence that lists `options`, with the ones nearest to `name` first in line.
 

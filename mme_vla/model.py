@@ -7,9 +7,13 @@
 Data flows down once. The backbone does not call the integration, and neither knows which memory made the tokens. It
 needs torch, numpy, einops and timm; configuration, datasets and simulation are in other packages.
 
-    backbone/   base.py (interface) · pi05.py · gemma.py (joint experts, KV cache) · siglip.py · attention.py · flow.py
-    memory/     base.py (interface) · history.py (stored tokens of an episode) · encoder.py · framesamp.py · …
-    integration/ base.py (interface) · context.py · modulator.py · expert.py
+    backbone/   base.py (interface) · layers.py (visibility, attention, norms) · gemma.py (joint experts,
+                KV cache) · siglip.py · flow.py · pi05.py
+    memory/     base.py (interface, encoder) · history.py (stored tokens of an episode) · framesamp.py · …
+    integration/ base.py (interface) · context.py (context, expert) · modulator.py
+
+A memory works in two steps. `MemoryModule.gather_selection` chooses stored tokens, in a dataset or in an episode, and
+makes `Batch.history`. `MemoryModule.forward`, called here, encodes them.
 
 Shapes: b batch · n tokens · d width · v views · h action horizon · a action width (types.py).
 """
@@ -75,11 +79,7 @@ class MMEModel(nn.Module):
 
     @torch.no_grad()
     def sample(
-        self,
-        batch: Batch,
-        noise: Mapping[str, Tensor],
-        steps: int | None = None,
-        memory: MemoryTokens | None = None,
+        self, batch: Batch, noise: Mapping[str, Tensor], steps: int | None = None, memory: MemoryTokens | None = None
     ) -> Tensor:
         """A normalised chunk [b, h, a].
 

@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, check_choice, did_you_mean, require
 
 
 class Registry[T]:
@@ -35,8 +35,12 @@ class Registry[T]:
         def decorate(entry: Any) -> Any:
             taken = self._entries.get(name)
             # A module imported twice (once as __main__) registers an equal twin: that is no clash.
-            if taken is not None and getattr(taken, "__qualname__", None) != getattr(entry, "__qualname__", None):
-                raise UserError(f"{self.kind} {name!r} is already registered by {taken!r}; choose another name.")
+            require(
+                not (
+                    taken is not None and getattr(taken, "__qualname__", None) != getattr(entry, "__qualname__", None)
+                ),
+                f"{self.kind} {name!r} is already registered by {taken!r}; choose another name.",
+            )
             self._entries[name] = entry
             return entry
 
@@ -96,15 +100,13 @@ MEMORIES: Registry[Any] = Registry(
     },
 )
 INTEGRATIONS: Registry[Any] = Registry(
-    "integration", {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "expert", "film")}
+    "integration",
+    {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "film")}
+    | {"expert": "mme_vla.integration.context"},
 )
 BACKBONES: Registry[Any] = Registry(
     "backbone",
-    {
-        "pi05": "mme_vla.backbone.pi05",
-        "nano": "mme_vla.backbone.nano",
-        "openvla": "mme_vla.methods.openvla_oft.model",
-    },
+    {"pi05": "mme_vla.backbone.pi05", "nano": "mme_vla.backbone.nano", "openvla": "mme_vla.methods.openvla_oft.model"},
 )
 HEADS: Registry[Any] = Registry("flow head", dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"))
 POLICIES: Registry[Any] = Registry(
@@ -157,12 +159,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
             `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
 
-    Raises:
-        UserError: an unknown kind, or the name is taken.
-
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...
     """
-    if kind not in REGISTRIES:
-        raise UserError(f"There are no parts of kind {kind!r} to register. {did_you_mean(kind, REGISTRIES)}")
+    check_choice("kind of part", kind, REGISTRIES)
     return REGISTRIES[kind].register(name)

@@ -16,12 +16,13 @@ PACKAGE = ROOT / "mme_vla"
 
 MODEL = ["mme_vla.model", "mme_vla.backbone.pi05", "mme_vla.memory.framesamp", "mme_vla.integration.modulator"]
 """FrameSamp + Modulator, from image to loss."""
-NOT_READ = {"mme_vla", "mme_vla.errors", "mme_vla.registry"}
-"""Of no concern to the mathematics: messages, and the tables of names."""
+NOT_READ = {"mme_vla", "mme_vla.errors", "mme_vla.registry", "mme_vla.speed"}
+"""Of no concern to the mathematics: messages, tables of names, and marks of what can be made faster."""
 SELECTION = ["memory/tokendrop.py", "memory/history.py"]
 HEAD = ["backbone/flow.py"]
 SAMPLING = [
-    ("policy/base.py", "act"), ("policy/mme.py", "sample_actions"), ("model.py", "sample"),
+    ("policy/base.py", "act"), ("policy/mme.py", "predict_chunk"),
+    ("policy/mme.py", "sample_actions"), ("model.py", "sample"),
     ("backbone/pi05.py", "sample"),
 ]  # fmt: skip
 ALONE = "README.md"
@@ -71,7 +72,7 @@ def sampling() -> list[Path]:
         functions = {node.name for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.FunctionDef)}
         if call not in functions:
             sys.exit(f"{file} defines no {call}(); update the lists in {Path(__file__).name}")
-    return files
+    return list(dict.fromkeys(files))
 
 
 def block(page: str) -> str:

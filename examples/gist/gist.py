@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from mme_vla import Integration, MemoryTokens, register
-from mme_vla.backbone.attention import PI05_VISIBILITY, Block
+from mme_vla.backbone.layers import PI05_VISIBILITY, Block
 from mme_vla.integration.base import required
 
 

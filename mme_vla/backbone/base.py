@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import Block, Visibility
+from mme_vla.backbone.layers import Block, Visibility
 from mme_vla.types import Batch, Noise
 
 Hook = Callable[[int, Tensor], Tensor]

@@ -1,18 +1,10 @@
 """Sizes of π0.5 (`pi05`) and of its small twin (`tiny`), and the class that the section `backbone` names."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
-import torch
-from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode
-
-from mme_vla.backbone.base import Backbone
-from mme_vla.errors import UserError, brief
-from mme_vla.registry import BACKBONES
+from mme_vla.errors import brief, check_choice, check_multiple, require
 
 LARGEST, DEEPEST = 2**24, 2**10
 """Bounds of every size and of layers, far above any network here: a number of a damaged file exceeds them."""
@@ -21,12 +13,11 @@ LARGEST, DEEPEST = 2**24, 2**10
 def check_positive(config: Any, prefix: str) -> None:
     """Raise an error if a number of a dataclass is not a possible size."""
     for name, value in vars(config).items():
-        if isinstance(value, float) and not 0 < value < 1:
-            raise UserError(f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
-        if isinstance(value, int) and not isinstance(value, bool) and value < 1:
-            raise UserError(f"{prefix}{name}={brief(value)} must be at least 1.")
-        if isinstance(value, int) and value > (DEEPEST if name in ("depth", "horizon") else LARGEST):
-            raise UserError(f"{prefix}{name}={brief(value)} is larger than any network can be.")
+        if isinstance(value, float):
+            require(0 < value < 1, f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
+        if isinstance(value, int) and not isinstance(value, bool):
+            most = DEEPEST if name in ("depth", "horizon") else LARGEST
+            require(1 <= value <= most, f"{prefix}{name}={brief(value)} must be at least 1 and at most {most}.")
 
 
 @dataclass(frozen=True)
@@ -42,8 +33,7 @@ class VisionConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "vision.")
-        if self.image_size % self.patch_size:
-            raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
+        check_multiple("vision.", "image_size", self.image_size, "patch_size", self.patch_size)
 
 
 @dataclass(frozen=True)
@@ -76,63 +66,7 @@ class BackboneConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
-        if self.num_heads % self.num_kv_heads:
-            raise UserError(f"num_heads={self.num_heads} must be a multiple of num_kv_heads={self.num_kv_heads}.")
-        if self.head_dim % 2:
-            raise UserError(f"head_dim={self.head_dim} must be even: rotary embedding turns pairs.")
-        if self.action.width % 2:
-            raise UserError(f"action.width={self.action.width} must be even: the flow time is embedded in sin and cos.")
-        if self.time_distribution not in ("beta", "uniform"):
-            raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
-
-
-_INITIALISERS = {Tensor.normal_, Tensor.uniform_}
-
-
-@contextmanager
-def shapes_only() -> Iterator[None]:
-    """Build on `meta`, and leave out initialisation, a third of the time that building takes there."""
-    with torch.device("meta"), _WithoutInit():
-        yield
-
-
-class _WithoutInit(TorchFunctionMode):
-    def __torch_function__(
-        self,
-        func: Callable[..., Any],
-        types: Sequence[type],
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-    ) -> Any:
-        kwargs = kwargs or {}
-        if func in _INITIALISERS or getattr(func, "__module__", None) == nn.init.__name__:
-            tensor = args[0] if args else kwargs["tensor"]
-            if tensor.is_meta:
-                return tensor
-        return func(*args, **kwargs)
-
-
-def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
-    """The class that the section `backbone` names, and its sizes."""
-    from mme_vla.config.sections import read_section
-
-    kind: type[Backbone] = BACKBONES[str(section.get("name"))]
-    return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
-
-
-def shape_of(section: Mapping[str, Any]) -> Backbone:
-    """The backbone of a section without weights (on the device `meta`), for its sizes."""
-    shape: tuple[Any, Any] = read_backbone(section)
-    try:
-        hash(shape)
-    except TypeError:  # a dataclass that is not frozen
-        return _shape(*shape)
-    return _cached_shape(*shape)
-
-
-def _shape(kind: type[Backbone], sizes: Any) -> Backbone:
-    with shapes_only():
-        return kind(sizes)
-
-
-_cached_shape = lru_cache(maxsize=32)(_shape)
+        check_multiple("backbone.", "num_heads", self.num_heads, "num_kv_heads", self.num_kv_heads)
+        check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)  # of a rotation
+        check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)  # sin and cos of the flow time
+        check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))

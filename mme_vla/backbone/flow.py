@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Injection
-from mme_vla.errors import UserError
+from mme_vla.errors import check_sizes
 from mme_vla.registry import HEADS
 from mme_vla.types import Batch, Noise, Overlap
 
@@ -93,8 +93,7 @@ class FlowHead:
     """
 
     def __init__(self, horizon: int, action_dim: int, time_distribution: str = "beta", steps: int = EULER_STEPS):
-        if steps < 1:
-            raise UserError(f"backbone.head.steps={steps} must be at least 1.")
+        check_sizes("backbone.head", steps=steps)
         self.horizon, self.action_dim = horizon, action_dim
         self.time_distribution, self.steps = time_distribution, steps
 

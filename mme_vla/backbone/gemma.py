@@ -10,22 +10,28 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import (
+from mme_vla.backbone.base import Hook, bind_hook
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.layers import (
+    AdaRMSNorm,
     AttentionMask,
     Block,
     MaskLayout,
+    Modulation,
+    RMSNorm,
+    Rotation,
     Span,
     Visibility,
     apply_custom_positions,
     attend,
     build_mask,
+    compute_dtype,
+    rotate,
+    rotation,
     select_rows,
     token_positions,
 )
-from mme_vla.backbone.base import Hook, bind_hook
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
-from mme_vla.backbone.layers import AdaRMSNorm, Modulation, RMSNorm, Rotation, compute_dtype, rotate, rotation
-from mme_vla.speed.recompute import Recompute, run_layer
+from mme_vla.speed import Recompute, run_layer
 
 KeyValue = tuple[Tensor, Tensor]
 

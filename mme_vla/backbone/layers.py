@@ -1,9 +1,26 @@
-"""Layers that all experts share: float32 linear layers, rotary embedding, and RMS norms."""
+"""Layers that all experts share: float32 layers, rotary embedding, RMS norms, and attention by a visibility table."""
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from mme_vla.errors import check_choice, require
+
+Visibility = Mapping[str, frozenset[str] | set[str]]
+"""For each block of queries: the blocks whose keys it may attend to."""
+
+PI05_VISIBILITY: Visibility = {
+    "images": {"images", "prompt"},
+    "prompt": {"images", "prompt"},
+    "action": {"images", "prompt", "action"},
+}
+"""Images and prompt are one bidirectional block. Actions attend to everything and nothing attends to them."""
 
 
 def compute_dtype(x: Tensor) -> torch.dtype:
@@ -96,3 +113,230 @@ class AdaRMSNorm(nn.Module):
         """Normalise [b, n, d]. `condition` is the raw [b, c] or, when sampling, a modulation made beforehand."""
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
         return torch.addcmul(m.shift, rms_normalise(x), 1 + m.scale).to(x.dtype), m.gate.to(x.dtype)
+
+
+@dataclass
+class Block:
+    """A run of tokens that share a name, hence a row of the table, and an expert whose weights process them.
+
+    tokens: [b, n, d] at the expert's width. mask: [b, n] bool, False on padding.
+    positions: [b, n] custom rotary positions, on the same axis as those of the other blocks; None counts its tokens.
+    """
+
+    name: str
+    tokens: Tensor
+    mask: Tensor
+    expert: str
+    positions: Tensor | None = None
+
+    def __len__(self) -> int:
+        return self.tokens.shape[1]
+
+
+class Span(NamedTuple):
+    """A block's name and length: what a key-value cache keeps of it."""
+
+    name: str
+    length: int
+
+
+def visible_blocks(name: str, table: Visibility) -> frozenset[str] | set[str]:
+    """The blocks that a block of this name attends to."""
+    require(name in table, f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.")
+    return table[name]
+
+
+def attention_mask(
+    queries: Sequence[Span], keys: Sequence[Span], query_mask: Tensor, key_mask: Tensor, table: Visibility
+) -> Tensor:
+    """Query q attends to key k iff q's row of the table names k's block and both tokens are valid.
+
+    Args:
+        queries, keys: blocks in sequence order.
+        query_mask: [b, q] bool. key_mask: [b, k] bool.
+        table: the visibility table.
+
+    Returns:
+        [b, q, k] bool.
+    """
+    device = key_mask.device
+    rows = []
+    for query in queries:
+        row = visible_blocks(query.name, table)
+        sees = [torch.full((key.length,), key.name in row, device=device) for key in keys]
+        rows.append(torch.cat(sees).expand(query.length, -1))
+    return torch.cat(rows) & query_mask[:, :, None] & key_mask[:, None, :]
+
+
+def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
+    """Rotary positions [b, n]: valid tokens are counted, padding repeats the number before it (−1 first)."""
+    positions = mask.long().cumsum(1) - 1
+    return positions if past_mask is None else positions + past_mask.long().sum(1, keepdim=True)
+
+
+def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
+    """Rotary positions [b, n] of blocks in sequence order, with the custom positions of blocks that have them."""
+    if all(block.positions is None for block in blocks):
+        return numbered
+    parts = numbered.float().split([len(block) for block in blocks], 1)
+    positions = [
+        part if block.positions is None else block.positions for part, block in zip(parts, blocks, strict=True)
+    ]
+    return torch.cat(positions, 1)
+
+
+class MaskLayout(NamedTuple):
+    """The visibility table applied to the valid keys of a batch.
+
+    Padding queries get the same mask as valid ones of their block; their output is ignored. This avoids fully masked
+    rows, which produce NaN.
+
+    lengths: of the runs of queries, in sequence order. visible: [b, runs, k] bool.
+    """
+
+    lengths: tuple[int, ...]
+    visible: Tensor
+
+    @classmethod
+    def of(cls, queries: Sequence[Span], keys: Sequence[Span], valid: Tensor, table: Visibility) -> Self:
+        """The layout of blocks; neighbours with equal rows are one run.
+
+        Args:
+            queries, keys: blocks in sequence order. valid: [b, k] bool, of the keys. table: the visibility table.
+        """
+        runs: list[tuple[int, list[bool]]] = []
+        for query in queries:
+            sees = [key.name in visible_blocks(query.name, table) for key in keys]
+            if runs and runs[-1][1] == sees:
+                runs[-1] = (runs[-1][0] + query.length, sees)
+            else:
+                runs.append((query.length, sees))
+        parts = valid.split([key.length for key in keys], 1)
+        hidden = [torch.zeros_like(part) for part in parts]
+        rows = [
+            valid if all(sees) else torch.cat([p if s else h for p, h, s in zip(parts, hidden, sees, strict=True)], 1)
+            for _, sees in runs
+        ]
+        return cls(tuple(length for length, _ in runs), torch.stack(rows, 1))
+
+    def part(self, rows: Sequence[slice]) -> "MaskLayout":
+        """The layout of some of the queries, ranges of their indices in order."""
+        lengths, runs, start = [], [], 0
+        for run, length in enumerate(self.lengths):
+            count = sum(max(min(at.stop, start + length) - max(at.start, start), 0) for at in rows)
+            if count:
+                lengths.append(count)
+                runs.append(run)
+            start += length
+        visible = (
+            self.visible if len(runs) == len(self.lengths) else torch.stack([self.visible[:, run] for run in runs], 1)
+        )
+        return MaskLayout(tuple(lengths), visible)
+
+    def expand(self, rows: Tensor) -> Tensor:
+        """Values of each run [b, runs, k] for each query [b, n, k]: a view if there is one run."""
+        parts = [rows[:, run, None].expand(-1, length, -1) for run, length in enumerate(self.lengths)]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+BACKENDS = ("auto", "sdpa", "flex", "varlen")
+"""`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the layout, skips hidden keys.
+`varlen`: flash attention over keys packed for each run of queries. `auto`: see `build_mask`."""
+
+
+class SparseMask(Protocol):
+    """A mask in the form of another backend (mme_vla/speed/sparse_attention.py)."""
+
+    @property
+    def layout(self) -> MaskLayout: ...
+
+    def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """See `attend`."""
+        ...
+
+
+AttentionMask = Tensor | SparseMask | None
+"""The mask of `attend`: additive [b, 1, q, k], the form of another backend, or None (all keys are visible)."""
+
+BIG_NEGATIVE = -1e30
+"""Far below any logit, and still finite where kernels count in base 2 (times 1.44): no row becomes NaN."""
+
+ALIGNMENT = 8
+"""Keys a row of the mask is padded to, as fused kernels want it: otherwise they copy the mask in every layer."""
+
+KERNELS = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+"""On a GPU. cuDNN, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths (pytorch#196678)."""
+
+
+def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
+    """[b, q, k] bool → [b, 1, q, k] of 0 and `BIG_NEGATIVE`, made once per forward and shared by all layers.
+
+    Added to finite logits in float32 it absorbs them, so this equals replacing them.
+    """
+    return _padded(mask, dtype)[..., : mask.shape[-1]].unsqueeze(1)
+
+
+def layout_mask(layout: MaskLayout, dtype: torch.dtype) -> Tensor:
+    """The additive mask [b, 1, n, k] of a layout."""
+    return layout.expand(_padded(layout.visible, dtype))[..., : layout.visible.shape[-1]].unsqueeze(1)
+
+
+def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
+    *rows, keys = visible.shape
+    mask = torch.zeros(*rows, -(-keys // ALIGNMENT) * ALIGNMENT, dtype=dtype, device=visible.device)
+    mask[..., :keys].masked_fill_(~visible, BIG_NEGATIVE)
+    return mask
+
+
+def check_backend(name: str) -> str:
+    """The name of a backend."""
+    check_choice("policy.attention", name, BACKENDS)
+    return name
+
+
+def build_mask(layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: bool) -> AttentionMask:
+    """The mask of one backend, built once per forward and shared by all layers.
+
+    `auto` is `flex` for training on a GPU where layers are `compiled`, so that it is part of their code; else `sdpa`.
+    """
+    if backend == "auto":
+        backend = "flex" if compiled and layout.visible.is_cuda and torch.is_grad_enabled() else "sdpa"
+    if backend == "sdpa":
+        return layout_mask(layout, dtype)
+    from mme_vla.speed.sparse_attention import FlexMask, PackedMask
+
+    return FlexMask.of(layout) if backend == "flex" else PackedMask.of(layout)
+
+
+def select_rows(mask: AttentionMask, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
+    """The additive mask of some of the queries, for the last layer: they are few, whatever the backend."""
+    if isinstance(mask, Tensor):
+        return torch.cat([mask[:, :, at] for at in rows], 2)
+    assert mask is not None
+    return layout_mask(mask.layout.part(rows), dtype)
+
+
+def fused_kernels(x: Tensor) -> AbstractContextManager[object]:
+    """The context of every attention on a GPU: the kernels of `KERNELS` alone."""
+    return sdpa_kernel(KERNELS) if x.is_cuda else nullcontext()
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
+    """Scaled dot-product attention with grouped queries: query head n reads key head n // (N/K).
+
+    Args:
+        q: [b, q, N, h]; k, v: [b, k, K, h].
+        mask: of `build_mask`; or additive [b, 1, q, k] in q's dtype; or bool with a key in every row; or None.
+
+    Returns:
+        [b, q, N·h].
+    """
+    if mask is not None and not isinstance(mask, Tensor):
+        return mask.attend(q, k, v)
+    groups = q.shape[2] // k.shape[2]
+    q, k, v = (x.transpose(1, 2) for x in (q, k, v))
+    if groups > 1:
+        # One shared key head broadcasts without a copy; several are repeated.
+        k, v = ((x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1)) for x in (k, v))
+    with fused_kernels(q):
+        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)

@@ -12,17 +12,15 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import Block, additive_mask, attend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hook, Injection, bind_hook
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
-from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm
+from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.errors import UserError
+from mme_vla.errors import check_choice, check_multiple
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import Recomputes
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch, Noise, map_noise
 
 
@@ -44,11 +42,9 @@ class TowerConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "vision.")
-        if self.image_size % 16:
-            raise UserError(f"vision.image_size={self.image_size} must be a multiple of 16.")
-        for width in (self.width_32, self.width_16, self.width_8):
-            if width % 8:
-                raise UserError(f"vision: {width} channels cannot be normalised in 8 groups; take a multiple of 8.")
+        check_multiple("vision.", "image_size", self.image_size, "stride", 16)
+        for name in ("width_32", "width_16", "width_8"):
+            check_multiple("vision.", name, getattr(self, name), "groups", 8)
 
 
 @dataclass(frozen=True)
@@ -71,10 +67,9 @@ class NanoConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
-        if self.action.width % 2 or self.head_dim % 2:
-            raise UserError("backbone.action.width and backbone.head_dim must be even.")
-        if self.time_distribution not in ("beta", "uniform"):
-            raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
+        check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)
+        check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)
+        check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))
 
 
 MAX_VIEWS, MAX_WORDS = 4, 256

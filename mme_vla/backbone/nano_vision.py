@@ -7,7 +7,7 @@ from importlib.resources import files
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 
 WEIGHTS = "assets/nano_vision.safetensors"
 STRIDES = (4, 2, 2)
@@ -110,10 +110,10 @@ def load_shipped(tower: ConvTower) -> None:
 
     state = {name: value.float() for name, value in load(files("mme_vla").joinpath(WEIGHTS).read_bytes()).items()}
     expected = tower.state_dict()
-    if {name: value.shape for name, value in state.items()} != {name: value.shape for name, value in expected.items()}:
-        raise UserError(
-            "The vision weights that ship with the library are for the sizes in configs/backbone/nano.yaml. With "
-            "others set backbone.vision.pretrained=false, or train a tower of that size: python -m "
-            "mme_vla.nano.vision_pretrain."
-        )
+    require(
+        {name: value.shape for name, value in state.items()} == {name: value.shape for name, value in expected.items()},
+        "The vision weights that ship with the library are for the sizes in configs/backbone/nano.yaml. With "
+        "others set backbone.vision.pretrained=false, or train a tower of that size: python -m "
+        "mme_vla.nano.vision_pretrain.",
+    )
     tower.load_state_dict(state)

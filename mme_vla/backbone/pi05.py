@@ -8,16 +8,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.attention import Block, check_backend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
-from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, float32_linear
+from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recomputes, Sharded
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
 from mme_vla.types import Batch, Noise, PastViews
 
 if TYPE_CHECKING:

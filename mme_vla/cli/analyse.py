@@ -21,13 +21,13 @@ from typing import TYPE_CHECKING, Any
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, check_choice
 from mme_vla.utils import safe_name
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.evaluation.analyses.replay import RecurrenceCurves
     from mme_vla.evaluation.analyses.rerun_log import RerunLog
+    from mme_vla.evaluation.analyses.watches import Watch
     from mme_vla.policy.mme import MMEPolicy
 
 EXAMPLES = (
@@ -48,19 +48,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def attention(args: argparse.Namespace) -> None:
     """Print the table of attention mass; the paper's beside it, where it has this model."""
-    from mme_vla.evaluation.analyses.replay import replay_all
     from mme_vla.evaluation.analyses.watches import AttentionWatch
 
     policy, source, name = _subject(args)
-    with AttentionWatch(policy) as watch, _rerun(args) as log:
-
-        def draw(episode: int, step: int) -> None:
-            if log is not None:
-                log.views(source, episode, step)
-                for part, mean, _ in watch.lap().table():
-                    log.number(f"attention/{part}", mean)
-
-        chunks = replay_all(policy, source, args.episodes, args.stride, args.most, draw)
+    watch = AttentionWatch(policy)
+    laps = lambda: {f"attention/{part}": mean for part, mean, _ in watch.lap().table()}  # noqa: E731
+    chunks = _watch(args, watch, laps, policy, source)
     mass = watch.result()
     known = _paper("attention_allocation", name)
     rows = []
@@ -74,20 +67,17 @@ def attention(args: argparse.Namespace) -> None:
 
 def modulation(args: argparse.Namespace) -> None:
     """Print mean and deviation of scale and bias, by layer and over all."""
-    from mme_vla.evaluation.analyses.replay import replay_all
     from mme_vla.evaluation.analyses.watches import ModulationWatch
 
     policy, source, name = _subject(args)
-    with ModulationWatch(policy) as watch, _rerun(args) as log:
+    watch = ModulationWatch(policy)
 
-        def draw(episode: int, step: int) -> None:
-            if log is not None:
-                log.views(source, episode, step)
-                for part, (mean, std) in watch.lap().overall.items():
-                    log.number(f"modulation/{part}_mean", mean)
-                    log.number(f"modulation/{part}_deviation", std)
+    def laps() -> dict[str, float]:
+        pairs = watch.lap().overall.items()
+        return {f"modulation/{part}_{kind}": value for part, values in pairs
+                for kind, value in zip(("mean", "deviation"), values, strict=True)}  # fmt: skip
 
-        chunks = replay_all(policy, source, args.episodes, args.stride, args.most, draw)
+    chunks = _watch(args, watch, laps, policy, source)
     stats = watch.result()
     layers = [
         [str(i), *(f"{mean[i]:.4f} ± {std[i]:.4f}" for mean, std in (stats.scale, stats.bias))]
@@ -101,6 +91,27 @@ def modulation(args: argparse.Namespace) -> None:
     _save(args, {"model": name, "chunks": chunks, **stats.overall})
 
 
+def _watch(
+    args: argparse.Namespace,
+    watch: "Watch[Any]",
+    laps: Callable[[], dict[str, float]],
+    policy: "MMEPolicy",
+    source: "EpisodeSource",
+) -> int:
+    """Replay the episodes with a watch and log its laps; how many chunks were chosen."""
+    from mme_vla.evaluation.analyses.replay import replay_all
+
+    with watch, _rerun(args) as log:
+
+        def draw(episode: int, step: int) -> None:
+            if log is not None:
+                log.views(source, episode, step)
+                for name, value in laps().items():
+                    log.number(name, value)
+
+        return replay_all(policy, source, args.episodes, args.stride, args.most, draw)
+
+
 def recurrence(args: argparse.Namespace) -> None:
     """Draw a recurrent memory's numbers along episodes, and write them as CSV."""
     from mme_vla.evaluation.analyses.replay import recurrence_curves, recurrence_plot
@@ -111,7 +122,10 @@ def recurrence(args: argparse.Namespace) -> None:
         episode_curves = [recurrence_curves(policy, source, episode, args.stride) for episode in numbers]
         if log is not None:
             for curves in episode_curves:
-                _log_curves(log, source, curves)
+                for i, frame in enumerate(curves.frames.tolist()):
+                    log.views(source, curves.episode, frame)
+                    for key, values in curves.curves.items():
+                        log.number(f"recurrence/{key}", values[i])
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(recurrence_plot(episode_curves, f"{name} on {source.name}"), encoding="utf-8")
@@ -128,13 +142,6 @@ def recurrence(args: argparse.Namespace) -> None:
     ]
     _print(f"{name} on {source.name}", ["episode", "", "first frame", "last frame", "mean"], rows)
     print(f"wrote {path} and {path.with_suffix('.csv')}")
-
-
-def _log_curves(log: "RerunLog", source: "EpisodeSource", curves: "RecurrenceCurves") -> None:
-    for i, frame in enumerate(curves.frames.tolist()):
-        log.views(source, curves.episode, frame)
-        for key, values in curves.curves.items():
-            log.number(f"recurrence/{key}", values[i])
 
 
 def selection(args: argparse.Namespace) -> None:
@@ -168,8 +175,7 @@ def cost(args: argparse.Namespace) -> None:
     known = all_models()
     models = args.models or (["framesamp_modul", "tokendrop_modul"] if args.budgets is not None else known)
     for model in models:
-        if model not in known:
-            raise UserError(f"Unknown model {model!r}. {did_you_mean(model, known)}")
+        check_choice("model", model, known)
     if args.budgets is not None:
         success = {int(row["memory_tokens"]): row for row in paper_table("memory_budget")}
         rows = []

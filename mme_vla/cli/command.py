@@ -11,6 +11,7 @@ from pathlib import Path
 
 import hydra
 from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -20,9 +21,11 @@ from mme_vla.cli.help import help_page, unknown_option
 from mme_vla.config import plugins
 from mme_vla.config.composition import (
     VERSION_BASE,
+    command_trees,
     compose,
     config_dir,
     import_plugins,
+    join_plugins,
     local_hydra,
     name_under_hydra,
     parse,
@@ -47,6 +50,8 @@ def cli[T](
             with print_user_errors():  # here too: Hydra would print a traceback before it gets further
                 _require_values(cfg)
                 join_memories(cfg)
+                hydra_cfg = HydraConfig.get()
+                join_plugins(cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task)
                 if {"name", "memory"} <= set(cfg):
                     cfg.name = name_under_hydra(_root_=cfg)
                 import_plugins(cfg)
@@ -94,6 +99,11 @@ def _check_command_line(config_name: str, tree: Path) -> None:
     args, unknown = get_args_parser().parse_known_intermixed_args()
     if unknown:
         raise unknown_option(unknown[0], sys.argv[1:], known_keys(config_name, tree))
+    if (
+        len(modes := [mode for mode in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(args, mode)])
+        > 1
+    ):
+        raise UserError(f"Use one of {' and '.join(f'--{mode}'.replace('_', '-') for mode in modes)}, not both.")
     if args.help:
         extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
         print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
@@ -107,8 +117,7 @@ def _check_command_line(config_name: str, tree: Path) -> None:
 def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
     """The text of `--help` beside these words (`mme_vla.cli.help`).
 
-    Args:
-        trees: folders of YAML files, the library's first.
+    trees: folders of YAML files, the library's first.
     """
 
     def selected_groups(overrides: Sequence[str]) -> dict[str, str]:
@@ -129,11 +138,7 @@ def known_keys(config_name: str, tree: Path) -> list[str]:
 
 
 def check_overrides(
-    config_name: str,
-    overrides: Sequence[str],
-    *,
-    directory: Path | None = None,
-    extra_dirs: Sequence[Path] = (),
+    config_name: str, overrides: Sequence[str], *, directory: Path | None = None, extra_dirs: Sequence[Path] = ()
 ) -> None:
     """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included."""
     columns = [_choices(override) for override in parse(overrides)]

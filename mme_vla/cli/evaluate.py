@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
+from mme_vla.config.composition import plain
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean
-from mme_vla.policy.saving import composition_digest
+from mme_vla.errors import check_choice
 
 if TYPE_CHECKING:
     import torch
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from mme_vla.policy.base import Policy
     from mme_vla.subgoal import SubgoalPredictor, Usage
 
-# Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 logger = logging.getLogger("mme_vla.evaluate")
 SUBGOAL_MODES = ("inline", "background")
@@ -40,19 +38,15 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.evaluation.recordings import all_recordings
     from mme_vla.evaluation.results.report import policy_facts
     from mme_vla.evaluation.rollout.evaluation import (
-        RunFacts,
-        checkpoint_label,
         choose_episodes,
         choose_shard,
         default_output,
         evaluate,
-        memory_budget,
+        facts_of,
     )
     from mme_vla.evaluation.rollout.settings import RolloutSettings
 
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
-    values = {str(key): value for key, value in config.items()}
+    values = plain(cfg)
     settings = RolloutSettings.from_config(values)
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
@@ -68,11 +62,8 @@ def main(cfg: DictConfig) -> None:
     sessions = values["recordings"]
     recordings = [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
     subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
-    facts = RunFacts(
-        name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
-        None if subgoals is None else str(values["subgoal"]["name"]), memory_budget(policy),
-        composition_digest(policy.config),
-    )  # fmt: skip
+    predictor = None if subgoals is None else str(values["subgoal"]["name"])
+    facts = facts_of(policy, name, source, settings, predictor)
     if not settings.render:
         logger.warning("render=false: the policy sees black images; only the time of the simulation means anything")
     output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
@@ -115,23 +106,18 @@ def choose_device(name: str) -> "torch.device":
 
 
 def choose_subgoals(
-    policy: "Policy",
-    section: dict[str, Any] | None,
-    mode: str = "inline",
-    device: "torch.device | None" = None,
+    policy: "Policy", section: dict[str, Any] | None, mode: str = "inline", device: "torch.device | None" = None
 ) -> "SubgoalPredictor | None":
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
 
-    Args:
-        section: the section `subgoal` of the configuration. mode: `inline`, or `background`.
-        device: the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the predictor.
+    section: the section `subgoal` of the configuration. mode: `inline`, or `background`. device: the policy's; a
+    predictor with `device: auto` runs there too. None leaves the choice to the predictor.
     """
     from mme_vla.evaluation.rollout.evaluation import check_subgoals
     from mme_vla.processing.prompt import subgoal_kind
     from mme_vla.subgoal import BackgroundPredictor, build_predictor
 
-    if mode not in SUBGOAL_MODES:
-        raise UserError(f"subgoal_mode={mode!r}. {did_you_mean(mode, SUBGOAL_MODES)}")
+    check_choice("subgoal_mode", mode, SUBGOAL_MODES)
     if section is None:
         if policy.require_processor().prompt_spec.reads_subgoal:
             logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")

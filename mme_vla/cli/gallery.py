@@ -10,7 +10,7 @@ import numpy as np
 from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 from mme_vla.utils.pages import render
 
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
 COLUMNS = 4  # images a row
-EVERY = 8
-"""Steps between two images that are taken; which of them are shown is decided at the end."""
+EVERY = 8  # Steps between two images that are taken; which of them are shown is decided at the end
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,7 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.data.console import progress
 
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    if not isinstance(cfg.tiles, int) or cfg.tiles < 2:
-        raise UserError(f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
+    require(isinstance(cfg.tiles, int) and cfg.tiles >= 2, f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
     require_simulator()
     folder = Path(cfg.output)
     folder.mkdir(parents=True, exist_ok=True)

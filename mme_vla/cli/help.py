@@ -132,8 +132,7 @@ OPTIONS = (
     ("--config-dir DIR", "search YAML files of your own too"),
     ("--multirun", "run once for each of several choices: model=framesamp_modul,tokendrop_modul"),
 )
-WIDEST, UNKNOWN_WIDTH = 120, 100
-"""Columns at most; columns where there is no terminal."""
+WIDEST, UNKNOWN_WIDTH = 120, 100  # Columns at most; columns where there is no terminal
 SelectGroups = Callable[[Sequence[str]], dict[str, str]]
 """From the words of a command line to the file that each group then takes."""
 
@@ -141,9 +140,8 @@ SelectGroups = Callable[[Sequence[str]], dict[str, str]]
 def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], select: SelectGroups) -> str:
     """The text of `--help`.
 
-    Args:
-        config_name: the command's file. words: what stands beside `--help`: names of groups, and overrides.
-        trees: folders of YAML files, the library's first. select: composes.
+    config_name: the command's file. words: what stands beside `--help`: names of groups, and overrides. trees: folders
+    of YAML files, the library's first. select: composes.
     """
     file = next(tree / f"{config_name}.yaml" for tree in trees if (tree / f"{config_name}.yaml").is_file())
     overrides = [word for word in words if "=" in word]
@@ -246,9 +244,8 @@ def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
 def unknown_option(option: str, words: Sequence[str], paths: Sequence[str]) -> UserError:
     """What to type instead of an option that there is not: settings are `key=value` words here.
 
-    Args:
-        option: as it was typed, `--steps` or `--steps=10`. words: the command line. paths: dotted keys of the
-            configuration.
+    option: as it was typed, `--steps` or `--steps=10`. words: the command line. paths: dotted keys of the
+    configuration.
     """
     name, _, value = option.lstrip("-").partition("=")
     after = words[words.index(option) + 1 :][:1] if option in words else []
@@ -274,8 +271,7 @@ def near_keys(name: str, paths: Sequence[str], most: int = 3) -> list[str]:
 def argument_parser(command: str, text: str | None, examples: Sequence[str]) -> argparse.ArgumentParser:
     """A parser for commands that read options instead of a configuration, with the same kind of `--help`.
 
-    Args:
-        command: as it is typed. text: what it does. examples: what is typed after it.
+    command: as it is typed. text: what it does. examples: what is typed after it.
     """
     listed = "\n".join(f"  {command} {example}".rstrip() for example in examples)
     return argparse.ArgumentParser(

@@ -142,8 +142,9 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
 
 def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
     """The episode and step asked for; the last step by default."""
-    if not isinstance(episode, int) or not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    from mme_vla.evaluation.analyses.replay import check_episode
+
+    check_episode(source, episode)
     length = int(source.lengths[episode])
     step = length - 1 if step is None else step
     if not isinstance(step, int) or not 0 <= step < length:
@@ -153,7 +154,7 @@ def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tupl
 
 def build_memory(cfg: DictConfig) -> "Memory":
     """The memory the configuration names, of any width: it is only asked to select."""
-    from mme_vla.backbone.config import shape_of
+    from mme_vla.backbone.building import shape_of
     from mme_vla.policy import mme
 
     config: Any = OmegaConf.to_container(cfg, resolve=True)
@@ -162,13 +163,7 @@ def build_memory(cfg: DictConfig) -> "Memory":
 
 
 def draw_memory(
-    source: "EpisodeSource",
-    episode: int,
-    step: int,
-    memory: "Memory",
-    name: str,
-    folder: Path,
-    console: "Console",
+    source: "EpisodeSource", episode: int, step: int, memory: "Memory", name: str, folder: Path, console: "Console"
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
     from mme_vla.data.memory_image import memory_sheet

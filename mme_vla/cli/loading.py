@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from omegaconf import DictConfig
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, check_choice, require
 
 if TYPE_CHECKING:
     import torch
@@ -42,13 +42,13 @@ def load_policy(
 ) -> LoadedPolicy:
     """Load `checkpoint`, or build `model` with fresh weights and say so.
 
-    Args:
-        cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from.
-        verb: what the command does with it, for messages. device: instead of the configured one.
+    cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from. verb: what the command does
+    with it, for messages. device: instead of the configured one.
     """
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.run_folders import locate_checkpoint
+    from mme_vla.processing.normalise import NormStats
 
     device = find_device(cfg.device) if device is None else device
     named = words_of(*_MODEL_KEYS)
@@ -62,16 +62,14 @@ def load_policy(
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)
         return LoadedPolicy(policy, name, where)
-    if not any(word.startswith("model=") for word in named):
-        raise UserError(
-            f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out."
-        )
-    from mme_vla.testing.small import unit_stats
-
-    if cfg.dtype not in ("auto", "float32"):
-        raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
+    require(
+        any(word.startswith("model=") for word in named),
+        f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out.",
+    )
+    require(cfg.dtype in ("auto", "float32"), f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
-    policy.require_processor().stats = unit_stats(policy.embodiment)
+    robot = policy.embodiment
+    policy.require_processor().stats = NormStats.unit(robot.state.width, robot.action.width)
     logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
     return LoadedPolicy(policy, str(cfg.name), None)
 
@@ -84,8 +82,7 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
     """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
     from mme_vla.policy.capabilities import CompilesSampling
 
-    if sampling not in SAMPLING:
-        raise UserError(f"sampling={sampling!r}. {did_you_mean(str(sampling), SAMPLING)}")
+    check_choice("sampling", sampling, SAMPLING)
     on_gpu = policy.device.type == "cuda"
     if sampling == "graph" and not on_gpu:
         raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")

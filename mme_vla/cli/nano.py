@@ -1,6 +1,5 @@
 """`python -m mme_vla.nano task=VideoUnmask model=framesamp_modul`: from nothing to a page of results on two cores."""
 
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,11 +9,11 @@ from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
-from mme_vla.config.composition import command_trees, config_dir
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.config.composition import command_trees, config_dir, plain
+from mme_vla.errors import UserError, brief
 from mme_vla.utils import read_json, write_json
 
 if TYPE_CHECKING:
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
     from mme_vla.evaluation.records import EpisodeRecord
     from mme_vla.nano.demonstrations import Scene
 
-# Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 SEEDS_APART = 100_000  # first seeds of two difficulties
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
 
@@ -56,19 +53,17 @@ def command(cfg: DictConfig) -> None:
     """Record, train, evaluate and write the page, each as far as it is not there."""
     from mme_vla.envs.make import check_names, require_simulator
 
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
+    config = plain(cfg)
     check_names(config["task"], "mme_vla", "waypoint", None, None)
     check_counts(config["demonstrations"])
     require_simulator()
-    run({str(key): value for key, value in config.items()}, command_trees()[1:])
+    run(config, command_trees()[1:])
 
 
 def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     """All stages of a run; the path of its page; of a folder, where other commands are to continue there.
 
-    Args:
-        config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
+    config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
     """
     from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
@@ -141,14 +136,13 @@ def plan_all(config: Mapping[str, Any], folder: Path) -> "list[EpisodeRecord]":
 
 def check_counts(counts: Any) -> None:
     """Make sure that demonstrations are asked for as difficulty: how many."""
-    known = ("easy", "medium", "hard")
-    if not isinstance(counts, Mapping) or not all(isinstance(n, int) and n >= 0 for n in counts.values()):
-        raise UserError(f"demonstrations={brief(counts)}: write how many of each difficulty, such as {{easy: 100}}.")
-    for level in counts:
-        if level not in known:
-            raise UserError(f"Unknown difficulty {brief(level)}. {did_you_mean(str(level), known)}")
-    if sum(counts.values()) < 2:
-        raise UserError(f"demonstrations={brief(counts)}: it takes two, to learn from and to measure by.")
+    levels = ("easy", "medium", "hard")
+    fits = isinstance(counts, Mapping) and all(isinstance(n, int) and n >= 0 for n in counts.values())
+    if not fits or not set(counts) <= set(levels) or sum(counts.values()) < 2:
+        raise UserError(
+            f"demonstrations={brief(counts)}: write how many of each difficulty ({', '.join(levels)}), such as "
+            "{easy: 100}; it takes two, to learn from and to measure by."
+        )
 
 
 def record_all(
@@ -156,8 +150,7 @@ def record_all(
 ) -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
 
-    Args:
-        choices: what the memories that will train on them read. robot: the one that does.
+    choices: what the memories that will train on them read. robot: the one that does.
     """
     from mme_vla.data.console import progress
     from mme_vla.nano.demonstrations import Scene

@@ -2,15 +2,18 @@
 
 import logging
 import sys
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.config.composition import plain
+from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.episodes import named_tasks
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
 from mme_vla.play.game import ChoiceSession, EpisodeId
@@ -20,24 +23,27 @@ log = logging.getLogger("mme_vla.play")
 HUMAN = "human"
 
 
+@dataclass(frozen=True)
+class PlaySettings:
+    """The keys of configs/play.yaml that decide the outcomes, beside the player."""
+
+    split: str
+    env: Literal["mme_vla", "official"]
+    max_steps: PositiveInt
+    max_choices: PositiveInt
+
+
 @cli("play")
 def main(cfg: DictConfig) -> None:
     """Play the episodes that are not played yet, on the page or by a model, and compare with the paper."""
-    from mme_vla.envs.make import ENVS
     from mme_vla.play import build_player
     from mme_vla.play.web import require_page
 
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    config = plain(cfg)
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
     specs = choose_episodes(named_tasks(config), config["episodes"], config["split"])
-    for name in ("max_steps", "max_choices"):
-        if isinstance(config[name], bool) or not isinstance(config[name], int) or config[name] < 1:
-            raise UserError(f"{name}={config[name]!r}; expected a positive integer.")
-    if config["env"] not in ENVS:
-        raise UserError(f"Unknown environment {config['env']!r}. {did_you_mean(str(config['env']), ENVS)}")
-    names = ("split", "env", "max_steps", "max_choices")
-    settings = {name: config[name] for name in names}
+    settings: dict[str, Any] = asdict(read_section(PlaySettings, config, others=True))
     settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
     human = player["name"] == HUMAN
     built = None if human else build_player(player)

@@ -1,23 +1,21 @@
 """`python -m mme_vla.probe checkpoint=…`: what a policy takes from its memory (configs/probe.yaml)."""
 
 import logging
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
+from mme_vla.config.composition import plain
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     from mme_vla.evaluation.recordings import Recording
     from mme_vla.policy.base import Policy
 
-# Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 logger = logging.getLogger("mme_vla.probe")
 
@@ -27,22 +25,13 @@ def main(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
-    from mme_vla.evaluation.rollout.evaluation import (
-        RunFacts,
-        checkpoint_label,
-        choose_episodes,
-        choose_shard,
-        memory_budget,
-    )
+    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, facts_of
     from mme_vla.evaluation.rollout.settings import RolloutSettings
-    from mme_vla.policy.saving import composition_digest
     from mme_vla.probing.offline import OfflineSettings
     from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
     from mme_vla.utils import safe_name
 
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
-    values: dict[str, Any] = {str(key): value for key, value in config.items()}
+    values = plain(cfg)
     if values["compare"] is not None:
         print(_table(values["compare"]))
         return
@@ -62,11 +51,8 @@ def main(cfg: DictConfig) -> None:
     recordings = _recordings(values["recordings"], policy)
     probed = _select(recordings, values["recorded"]) if values["offline"] else []
     subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device) if jobs else None
-    facts = RunFacts(
-        name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
-        None if subgoals is None else str(values["subgoal"]["name"]), memory_budget(policy),
-        composition_digest(policy.config),
-    )  # fmt: skip
+    predictor = None if subgoals is None else str(values["subgoal"]["name"])
+    facts = facts_of(policy, name, source, settings, predictor)
     folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)

@@ -18,7 +18,7 @@ from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.utils.processes import end_with_parent, signals_deferred
 
@@ -122,8 +122,7 @@ def report_coverage(
 ) -> None:
     """Say which goals of a split the recorded episodes lack, and write it as JSON.
 
-    Args:
-        plan: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
+    plan: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
     """
     from mme_vla.data.console import progress
     from mme_vla.envs.recording.coverage import compare, goal_of, goals_recorded, in_words
@@ -151,8 +150,7 @@ def _begin_worker(plugins: Sequence[str]) -> None:
 def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
     """Do work that simulates, in so many processes; what came of it, as it is done.
 
-    Args:
-        work: importable by name, or a partial of such, where there are several processes.
+    work: importable by name, or a partial of such, where there are several processes.
     """
     if workers == 1 or len(jobs) < 2:
         import mme_vla.envs.task  # noqa: F401
@@ -192,8 +190,7 @@ def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
     memory: Any
     frames, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
     if frames == "all":
-        if memory is not None:
-            raise UserError("frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
+        require(memory is None, "frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
         return None
     return FrameChoice(frames, memory)
 
@@ -252,11 +249,11 @@ def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
 
 def _claim(work: Path, jobs: Sequence[Job]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
-    if not claim_plan(work, [job.plan for job in jobs]):
-        raise UserError(
-            f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
-            "another output, or remove that folder yourself."
-        )
+    require(
+        claim_plan(work, [job.plan for job in jobs]),
+        f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
+        "another output, or remove that folder yourself.",
+    )
 
 
 def main() -> None:

@@ -44,11 +44,7 @@ DEMO = (
 )
 
 
-EXAMPLES = (
-    "outputs/evaluation --html report.html",
-    "runs/a runs/b --compare framesamp_modul pi05",
-    "--demo --brief",
-)
+EXAMPLES = ("outputs/evaluation --html report.html", "runs/a runs/b --compare framesamp_modul pi05", "--demo --brief")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -101,15 +97,20 @@ def show_curves(curves: Curves, args: argparse.Namespace) -> None:
 
     table = stress_table(curves)
     print_table(table, 200)
+    texts: dict[Path, str] = {}
     if args.markdown:
-        args.markdown.parent.mkdir(parents=True, exist_ok=True)
-        args.markdown.write_text(to_markdown(table), encoding="utf-8")
+        texts[args.markdown] = to_markdown(table)
     if args.html:
         caption = "Episodes that every place of the dial has."
         boxes = [Section(name, figure, caption=caption) for name, figure in stress_figures(curves).items()]
-        args.html.parent.mkdir(parents=True, exist_ok=True)
-        page = html_page(args.title, [*boxes, Section(table.title, tables=[table])])
-        args.html.write_text(page, encoding="utf-8")
+        texts[args.html] = html_page(args.title, [*boxes, Section(table.title, tables=[table])])
+    _write(texts)
+
+
+def _write(texts: dict[Path, str]) -> None:
+    for path, text in texts.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
 
 
 def write(results: Results, comparisons: list[Comparison], args: argparse.Namespace) -> list[Path]:
@@ -133,22 +134,15 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         from mme_vla.evaluation.results.report import html_report
 
         texts[args.html] = html_report(results, comparisons, args.title)
-    for path, text in texts.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+    _write(texts)
     return list(texts)
 
 
 def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
     tables = [overview(results)]
     if detailed:
-        tables = [
-            *(detail(method, results) for method in results.methods),
-            *process_tables(results),
-            *subgoal_tables(results),
-            runs_table(results),
-            *tables,
-        ]
+        details = [detail(method, results) for method in results.methods]
+        tables = [*details, *process_tables(results), *subgoal_tables(results), runs_table(results), *tables]
     return [*tables, comparison_table(comparisons)] if comparisons else tables
 
 

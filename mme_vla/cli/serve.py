@@ -6,16 +6,15 @@ import os
 import signal
 from typing import TYPE_CHECKING
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling
+from mme_vla.config.composition import plain
 
 if TYPE_CHECKING:
     from mme_vla.serving.server import PolicyServer
 
-# Threads that wait asleep leave the event loop its core; it counts only when set before PyTorch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 logger = logging.getLogger("mme_vla.serving")
 
@@ -26,9 +25,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.serving.server import PolicyServer
     from mme_vla.serving.settings import ServeSettings
 
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
-    settings = ServeSettings.from_dict({str(key): value for key, value in config.items()})
+    settings = ServeSettings.from_dict(plain(cfg))
     log_to_terminal(logger, clock=True)
     policy, name, _ = load_policy(cfg, "serve", logger)
     prepare_sampling(policy, cfg.sampling, logger)

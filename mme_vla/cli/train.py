@@ -1,6 +1,5 @@
 """`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
 
-import os
 import shlex
 import sys
 import time
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.cli.command import cli
+from mme_vla.config.composition import plain
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.utils import remove_drafts, write_atomically
@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from mme_vla.training.runs import Run
     from mme_vla.training.settings import TrainSettings
 
-# Threads that wait for each other asleep: busy waiting slows a step tenfold when anything else runs on the same cores
-# (data workers do). It counts only when set before PyTorch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
 
 @cli("train")
 def main(cfg: DictConfig) -> None:
@@ -31,14 +27,13 @@ def main(cfg: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
 
     begun, named = time.perf_counter(), True
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
+    config = plain(cfg)
     fresh = Path(config["output"])
     if HydraConfig.initialized():
         fresh = Path(HydraConfig.get().runtime.output_dir)
         named = any(word.startswith("output=") for word in HydraConfig.get().overrides.task)
     try:
-        train(cfg, {str(key): value for key, value in config.items()}, fresh, begun, named)
+        train(cfg, config, fresh, begun, named)
     except UserError:
         with suppress(OSError):
             fresh.rmdir()  # Hydra made it; it stays if it holds anything
@@ -48,8 +43,7 @@ def main(cfg: DictConfig) -> None:
 def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, named: bool = True) -> Path:
     """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
 
-    Args:
-        named: whether the user chose the folder's name; another run may have begun in the same second.
+    named: whether the user chose the folder's name; another run may have begun in the same second.
 
     Returns:
         The last checkpoint.
@@ -169,4 +163,4 @@ def cache_command() -> str:
     words = [word for word in overrides if not word.startswith(("resume=", "output="))]
     if "--config-dir" in sys.argv[:-1]:
         words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
-    return shlex.join(["python", "-m", "mme_vla.data.cache", *words])
+    return shlex.join(["mme-vla", "cache", *words])

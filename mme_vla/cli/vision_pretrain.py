@@ -1,19 +1,17 @@
 """`mme-vla vision-pretrain`: the vision tower of the nano backbone, from renders of the tasks."""
 
 import logging
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, plain
 from mme_vla.errors import UserError
 
 logger = logging.getLogger("mme_vla.nano")
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 LEVELS = ("easy", "medium", "hard")
 
 
@@ -24,9 +22,7 @@ def main(cfg: DictConfig) -> None:
 
     require_simulator()
     log_to_terminal(logger)
-    config = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(config, dict)
-    print(run({str(key): value for key, value in config.items()}))
+    print(run(plain(cfg)))
 
 
 def run(config: Mapping[str, Any]) -> Path:

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
@@ -142,8 +142,7 @@ def convert(
     With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
     """
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
-    if not dry_run and target.exists():
-        raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
+    require(dry_run or not target.exists(), f"{target} exists: give a new folder, nothing is ever written over.")
     opened = open_source(source, revision, base=base)
     policy = _policy(opened, overrides, trust_plugins)
     check_target(policy, to)
@@ -179,8 +178,7 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         if overrides:
             raise UserError(f"{opened.folder} brings its own configuration: {' '.join(overrides)} would contradict it.")
         config = {key: value for key, value in opened.config.items() if key != "adapters"}
-        if "backbone" not in config:
-            raise UserError(f"{opened.folder} holds our weights but no config.json that describes them.")
+        require("backbone" in config, f"{opened.folder} holds our weights but no config.json that describes them.")
         import_trusted(config, str(opened.folder), trust_plugins)
         policy: Policy = build_saved(policy_class(config), config, str(opened.folder / CONFIG))
         policy.processor = load_processor(opened.folder)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra import version
@@ -21,7 +22,8 @@ from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
 from mme_vla.config import plugins
 from mme_vla.config.naming import (
@@ -35,7 +37,7 @@ from mme_vla.config.naming import (
     variant_name,
 )  # fmt: skip
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 VERSION_BASE = "1.3"
 
@@ -94,11 +96,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
 
 
 def compose(
-    config_name: str,
-    overrides: Sequence[str] = (),
-    *,
-    directory: Path | None = None,
-    extra_dirs: Sequence[Path] = (),
+    config_name: str, overrides: Sequence[str] = (), *, directory: Path | None = None, extra_dirs: Sequence[Path] = ()
 ) -> DictConfig:
     """Compose `config_name` under Hydra's override grammar; also from inside a running Hydra command.
 
@@ -110,8 +108,7 @@ def compose(
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     for folder in trees:
-        if not folder.is_dir():
-            raise UserError(f"The config folder {str(folder)!r} does not exist.")
+        require(folder.is_dir(), f"The config folder {str(folder)!r} does not exist.")
     words = several_memories(overrides)
     with local_hydra(trees[0], trees[1:]) as engine:
         tree = ConfigTree(engine.config_loader, config_name, parse(words))
@@ -120,6 +117,7 @@ def compose(
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
+    join_plugins(cfg, config_name, trees, words)
     if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
         cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
@@ -144,6 +142,30 @@ def command_trees() -> tuple[Path, ...]:
 OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
 
 
+def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overrides: Sequence[str]) -> None:
+    """Have `plugins` name the modules of every file that takes part; Hydra itself keeps the last file's list.
+
+    A list on the command line counts alone. The library's own files name no plugins.
+
+    trees: folders of YAML files, the library's first. overrides: those of the composition.
+    """
+    if not trees[1:] or any(word.lstrip("+").startswith("plugins=") for word in overrides):
+        return
+    with local_hydra(trees[0], trees[1:]) as engine:
+        loader = engine.config_loader
+        parts = loader.compute_defaults_list(config_name, list(overrides), RunMode.RUN).defaults
+        loaded = [loader.repository.load_config(part.config_path) for part in parts if not part.package]  # type: ignore
+        lists = [plugins.plugins_of(part.config, part.path) for part in loaded if part is not None]
+    if names := list(dict.fromkeys(name for names in lists for name in names)):
+        with open_dict(cfg):
+            cfg.plugins = names
+
+
+def plain(cfg: DictConfig) -> dict[str, Any]:
+    """A configuration as resolved plain values."""
+    return {str(key): value for key, value in OmegaConf.to_container(cfg, resolve=True).items()}  # type: ignore[union-attr]
+
+
 def import_plugins(cfg: DictConfig) -> None:
     """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`."""
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
@@ -152,8 +174,7 @@ def import_plugins(cfg: DictConfig) -> None:
 def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
     """The name of a composition, from the models of these trees.
 
-    Args:
-        config_name: the file that was composed. trees: folders of YAML files, the library's first.
+    config_name: the file that was composed. trees: folders of YAML files, the library's first.
     """
     if isinstance(cfg.get("memory"), ListConfig):
         cfg = join_memories(cfg.copy())

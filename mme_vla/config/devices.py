@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, check_choice
 
 if TYPE_CHECKING:
     import torch
@@ -35,11 +35,7 @@ def find_device(name: str) -> "torch.device":
 
 def checked_products(how: str) -> str:
     """`how`, once it is one of `FLOAT32_PRODUCTS`."""
-    if how not in FLOAT32_PRODUCTS:
-        raise UserError(
-            f"policy.float32_products={how!r}: choose ieee (exact products) or tf32 (their inputs keep ten bits on a "
-            f"GPU). {did_you_mean(str(how), FLOAT32_PRODUCTS)}"
-        )
+    check_choice("policy.float32_products", how, FLOAT32_PRODUCTS)  # exact; inputs keep ten bits on a GPU
     return how
 
 

@@ -10,10 +10,8 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-JOINED = "joined"
-"""The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)."""
-BUDGET = 512
-"""Memory tokens of a policy unless it says otherwise, as in the paper."""
+JOINED = "joined"  # The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)
+BUDGET = 512  # Memory tokens of a policy unless it says otherwise, as in the paper
 
 _SEVERAL = re.compile(r"/?memory=(\[.*\])")
 
@@ -68,11 +66,9 @@ DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget"
 FREE = ("memory.budget", "processor.tokenizer", "processor.text", "processor.side")
 """Keys in them that do not: a budget has a field of its own in records; pixels and words go with the backbone."""
 POLICY, DEFAULT_POLICY = "policy.name", "mme"
-LONGEST = 32
-"""Letters that differences may take in a name; more are a digest."""
+LONGEST = 32  # Letters that differences may take in a name; more are a digest
 
-Sections = dict[str, Any]
-"""Flat dotted keys of the decisive sections, those that are set."""
+Sections = dict[str, Any]  # Flat dotted keys of the decisive sections, those that are set
 Reference = Callable[[str], tuple[str, Sections] | None]
 """From the file name of a model to its name and sections; None where it cannot be composed."""
 

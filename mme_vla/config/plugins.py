@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 
 TRUST_FLAG, TRUST_WORD = "--trust-plugins", "trust_plugins=true"
 """How one says on a command line that the plugins of a checkpoint may be imported; every command takes both."""
@@ -60,18 +60,17 @@ def plugins_of(config: Any, source: str) -> list[str]:
 def import_trusted(config: Any, source: str, trust: bool) -> None:
     """Import the plugins that a checkpoint names.
 
-    Args:
-        config: the checkpoint's configuration. source: the checkpoint, for messages.
-        trust: the user has said that what it names may run here.
+    config: the checkpoint's configuration. source: the checkpoint, for messages. trust: the user has said that what it
+    names may run here.
     """
     names = plugins_of(config, source)
     strange = [name for name in names if name not in sys.modules]
-    if strange and not trust:
-        raise UserError(
-            f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that would run on this "
-            f"machine. If you know it and trust it, say so with {TRUST_FLAG} (from Python trust_plugins=True), and "
-            "start where the module can be found: in its folder, or with it installed."
-        )
+    require(
+        not strange or trust,
+        f"{source} needs the plugin {listed(strange)}: code that the checkpoint names and that would run on this "
+        f"machine. If you know it and trust it, say so with {TRUST_FLAG} (from Python trust_plugins=True), and "
+        "start where the module can be found: in its folder, or with it installed.",
+    )
     import_plugins(names)
 
 

@@ -7,6 +7,7 @@ Annotations declare all of it: `port: Annotated[int, Range(0, 65535)]`, `kind: L
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
@@ -27,7 +28,7 @@ class Range:
 
     def holds(self, value: float) -> bool:
         """Whether a number is within the bounds."""
-        return math.isfinite(value) and self.least <= value <= self.most and value > self.above
+        return self.above < value < math.inf and self.least <= value <= self.most
 
     @property
     def text(self) -> str:
@@ -59,10 +60,9 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
     needed = [n for n, spec in specs.items() if spec.default is MISSING and spec.default_factory is MISSING]
     if others and isinstance(values, Mapping):
         values = {key: value for key, value in values.items() if key in specs}
-    parsed, hints = section_keys(values, where, specs), get_type_hints(kind, include_extras=True)
-    for key in needed:
-        if key not in parsed:
-            raise _lacking(where, key, parsed)
+    parsed, hints = section_keys(values, where, specs), _hints(kind)  # type: ignore[arg-type]
+    if lacking := [key for key in needed if key not in parsed]:
+        raise _lacking(where, lacking[0], parsed)
     read: dict[str, Any] = {}
     for key, value in parsed.items():
         name = f"{where}.{key}" if where else key
@@ -70,11 +70,15 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
             read[key] = _converted(value, hints[key], name)
         except _MisfitError:
             assigned = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
-            choices = _choices(hints[key])
-            if choices and isinstance(value, str):
-                raise UserError(f"{name}{assigned}. {did_you_mean(value, map(str, choices))}") from None
-            raise UserError(f"{name}{assigned} must be {_expected(hints[key])}.") from None
+            choices = isinstance(value, str) and _choices(hints[key])
+            hint = f". {did_you_mean(value, map(str, choices))}" if choices else f" must be {_expected(hints[key])}."
+            raise UserError(f"{name}{assigned}{hint}") from None
     return kind(**read, **fixed)
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
 
 
 def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
@@ -100,23 +104,21 @@ def _converted(value: Any, kind: Any, name: str) -> Any:
     origin, inside = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
-    if origin is Annotated:
-        number = _converted(value, inside[0], name)
-        if not all(bound.holds(number) for bound in inside[1:] if isinstance(bound, Range)):
-            raise _MisfitError
-        return number
-    if origin is Literal:
-        if not any(value == choice and type(value) is type(choice) for choice in inside):
-            raise _MisfitError
-        return value
     if origin in (Union, UnionType):
         return _first_that_fits(value, inside, name)
     if is_dataclass(kind):
         return value if isinstance(value, cast(type, kind)) else read_section(cast(type, kind), value, name)
     if origin is tuple:
         return _tuple(value, inside, name)
-    accepted = (int, float) if kind is float else (origin or kind,)
-    if isinstance(value, bool) != (kind is bool) or not isinstance(value, accepted):
+    if origin is Annotated:
+        value = _converted(value, inside[0], name)
+        fits = all(bound.holds(value) for bound in inside[1:] if isinstance(bound, Range))
+    elif origin is Literal:
+        fits = any(value == choice and type(value) is type(choice) for choice in inside)
+    else:
+        accepted = (int, float) if kind is float else (origin or kind,)
+        fits = isinstance(value, bool) == (kind is bool) and isinstance(value, accepted)
+    if not fits:
         raise _MisfitError
     return value
 
@@ -135,10 +137,8 @@ def _first_that_fits(value: Any, kinds: Sequence[Any], name: str) -> Any:
 
 
 def _tuple(value: Any, kinds: Sequence[Any], name: str) -> tuple[Any, ...]:
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        raise _MisfitError
     endless = len(kinds) == 2 and kinds[1] is Ellipsis
-    if not endless and len(value) != len(kinds):
+    if not isinstance(value, Sequence) or isinstance(value, str) or not (endless or len(value) == len(kinds)):
         raise _MisfitError
     each = [kinds[0]] * len(value) if endless else kinds
     return tuple(_converted(item, kind, name) for item, kind in zip(value, each, strict=True))

@@ -10,18 +10,15 @@ import re
 from collections import OrderedDict
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 from mme_vla.utils import Sums, decoding, files_to_hold, read_json, require_file, user_cache
-
-if TYPE_CHECKING:
-    pass
 
 FORMAT = 1  # of the files below
 PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
@@ -47,8 +44,7 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
         encoder: hash of the vision tower's weights (`policy.vision_fingerprint()`).
         dtype: `bfloat16` or `float32`.
     """
-    if dtype not in DTYPES:
-        raise UserError(f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
+    require(dtype in DTYPES, f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
     return {
         "format": FORMAT,
         "encoder": encoder,
@@ -107,10 +103,6 @@ class VisionCache:
         Args:
             folder: where it is (`cache_folder`). source: the dataset it belongs to.
             expected: the fingerprint it must have. command: what to tell the user to run, without `rebuild=true`.
-
-        Raises:
-            CacheMissingError: it does not exist or is half-written.
-            UserError: it was made of something else, or a file is damaged. Both name the command that mends it.
         """
         check_fingerprint(folder, expected, command)
         self.folder, self.spec = folder, StorageSpec(**expected["storage"])
@@ -124,8 +116,9 @@ class VisionCache:
                 f"Finish it with: {command}"
             )
         widths = {self._tokens(episode).shape[-1] for episode in range(len(source))}
-        if len(widths) > 1:
-            raise UserError(f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true")
+        require(
+            len(widths) <= 1, f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true"
+        )
         self.width = widths.pop()
         self.max_open = files_to_hold(len(source))
         self._histories: OrderedDict[int, CachedHistory] = OrderedDict()
@@ -154,8 +147,7 @@ class VisionCache:
         if episode in self._verified:
             return
         sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)
-        for name in sums.table:
-            sums.check(name)
+        sums.check(*sums.table)
         self._verified.add(episode)
 
     @property
@@ -167,11 +159,11 @@ class VisionCache:
         rows = len(stored_frames(self._source, episode, self.spec))
         with decoding(require_file(path), "tokens of a vision cache", self._remedy):
             tokens = np.lib.format.open_memmap(path, mode="r")
-        if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:
-            raise UserError(
-                f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
-                f"{self.spec.grid**2}, d] is expected. {self._remedy}"
-            )
+        require(
+            tokens.ndim == 3 and tokens.shape[:2] == (rows, self.spec.grid**2) and tokens.dtype == self._dtype,
+            f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
+            f"{self.spec.grid**2}, d] is expected. {self._remedy}",
+        )
         return tokens
 
     def _scores(self, episode: int) -> FrameScores | None:
@@ -181,19 +173,19 @@ class VisionCache:
         with decoding(require_file(path), "scores of a vision cache", self._remedy), np.load(path) as stored:
             frames, values = stored["frames"], stored["values"]
         length, patches = int(self._lengths[episode]), self.spec.grid**2
-        if (
-            (frames.dtype, values.dtype) != (np.int64, np.float32)
-            or frames.ndim != 1
-            or values.shape != (len(frames), patches)
-            or (frames < 0).any()
-            or (frames >= length).any()
-            or not np.isfinite(values).all()
-        ):
-            raise UserError(
-                f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames "
-                f"{list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below {length} are "
-                f"expected. {self._remedy}"
-            )
+        require(
+            (
+                (frames.dtype, values.dtype) == (np.int64, np.float32)
+                and frames.ndim == 1
+                and values.shape == (len(frames), patches)
+                and not (frames < 0).any()
+                and not (frames >= length).any()
+                and np.isfinite(values).all()
+            ),
+            f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames "
+            f"{list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below {length} are "
+            f"expected. {self._remedy}",
+        )
         return FrameScores(frames, values)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -201,11 +193,7 @@ class VisionCache:
 
 
 def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COMMAND) -> None:
-    """Make sure that `folder` was made of what is expected.
-
-    Raises:
-        CacheMissingError: there is nothing. UserError: it is something else; the message says what differs.
-    """
+    """Make sure that `folder` was made of what is expected."""
     path = folder / FINGERPRINT
     if not path.is_file():
         if folder.is_dir() and any(folder.iterdir()):

@@ -2,10 +2,10 @@
 
 import logging
 import os
-import queue
-import threading
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
@@ -34,7 +34,7 @@ from mme_vla.data.cache import (
 )
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, frames_scored, make_scorer
 from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
 
@@ -157,12 +157,10 @@ def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int
             continue
         images = source.frames(episode, required)
         frames, values = [], []
-        if scorer is not None:
-            for frame, image in zip(required.tolist(), images, strict=True):
-                row = scorer(frame, image)
-                if row is not None:
-                    frames.append(frame)
-                    values.append(np.asarray(row, np.float32))
+        for frame, image in zip(required.tolist(), images, strict=True):
+            if scorer is not None and (row := scorer(frame, image)) is not None:
+                frames.append(frame)
+                values.append(np.asarray(row, np.float32))
         yield _Chunk(stop - start, images[np.isin(required, here)], frames, values)
 
 
@@ -189,8 +187,7 @@ def _build_episode(
                 raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames")
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
-    if not rows:
-        raise UserError(f"{source.name}, episode {episode}: none of the frames that the memory stores was rendered.")
+    require(rows, f"{source.name}, episode {episode}: none of the frames that the memory stores was rendered.")
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
@@ -222,7 +219,6 @@ def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
 
 
 def _draft(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> Path:
-    """What will become `path`, on disk already."""
     draft = draft_of(path)
     with draft.open("wb") as handle:
         writer(handle, *arrays, **named)
@@ -283,41 +279,12 @@ _END = object()
 
 
 def ahead[T](things: Iterable[T], count: int) -> Generator[T, None, None]:
-    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where they are used.
-
-    Closing the generator ends the thread.
-    """
-    made: queue.Queue[Any] = queue.Queue(count)
-    closed = threading.Event()
-
-    def put(thing: Any) -> bool:
-        while not closed.is_set():
-            try:
-                made.put(thing, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
-
-    def make() -> None:
-        try:
-            for thing in things:
-                if not put((thing, None)):
-                    return
-            put((_END, None))
-        except BaseException as error:
-            put((_END, error))
-
-    thread = threading.Thread(target=make, name="ahead", daemon=True)
-    thread.start()
+    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where they are used."""
+    iterator, pool = iter(things), ThreadPoolExecutor(1, "ahead")
     try:
-        while True:
-            thing, error = made.get()
-            if error is not None:
-                raise error
-            if thing is _END:
-                return
+        pending: deque[Future[Any]] = deque(pool.submit(next, iterator, _END) for _ in range(count + 1))
+        while (thing := pending.popleft().result()) is not _END:
+            pending.append(pool.submit(next, iterator, _END))
             yield thing
     finally:
-        closed.set()
-        thread.join()
+        pool.shutdown(cancel_futures=True)

@@ -47,7 +47,22 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
 
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if not console.is_terminal:
-        yield _Lines(console.print, description, total, done, unit).advance
+        begun = reported = time.monotonic()
+        count = done
+
+        def count_up(steps: int) -> None:
+            nonlocal reported, count
+            count += steps
+            now = time.monotonic()
+            if count < total and now - reported < LINE_SECONDS:
+                return
+            reported = now
+            each = (now - begun) / max(count - done, 1)
+            remaining = f", about {_duration_text(each * (total - count))} left" if count < total else ""
+            so_far = f"{count:,} of {total:,} {unit}".rstrip()
+            console.print(f"{description}: {so_far} in {_duration_text(now - begun)}{remaining}")
+
+        yield count_up
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
     with Progress(*columns, TimeRemainingColumn(), console=console) as bar:
@@ -57,27 +72,6 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
             bar.advance(task, steps)
 
         yield advance
-
-
-class _Lines:
-    def __init__(self, say: Callable[[str], None], description: str, total: int, done: int, unit: str) -> None:
-        self._say, self._description, self._total, self._unit = say, description, total, unit
-        self._before = self._done = done
-        self._begun = self._reported = time.monotonic()
-
-    def advance(self, steps: int) -> None:
-        """Count; say so if it is time."""
-        self._done += steps
-        now = time.monotonic()
-        if self._done < self._total and now - self._reported < LINE_SECONDS:
-            return
-        self._reported = now
-        each = (now - self._begun) / max(self._done - self._before, 1)
-        remaining = (
-            f", about {_duration_text(each * (self._total - self._done))} left" if self._done < self._total else ""
-        )
-        count = f"{self._done:,} of {self._total:,} {self._unit}".rstrip()
-        self._say(f"{self._description}: {count} in {_duration_text(now - self._begun)}{remaining}")
 
 
 def _duration_text(seconds: float) -> str:

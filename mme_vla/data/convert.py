@@ -17,20 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.data.hdf5 import (
-    POSE_STATE,
-    SUBGOALS,
-    EpisodeRef,
-    RawEpisode,
-    RawFrame,
-    open_episode,
-    recorded_options,
-)
+from mme_vla.data.hdf5 import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame, open_episode, recorded_options
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
@@ -129,12 +121,10 @@ class ConvertOptions:
     names: str = "robomme"
 
     def __post_init__(self) -> None:
-        if self.images not in ("video", "png"):
-            raise UserError(f"images={self.images!r}: expected 'video' or 'png'.")
+        require(self.images in ("video", "png"), f"images={self.images!r}: expected 'video' or 'png'.")
         if self.names not in NAMES:
             raise UserError(f"names={self.names!r} is no spelling of columns. {did_you_mean(str(self.names), NAMES)}")
-        if self.fps < 1 or self.gop < 1:
-            raise UserError(f"fps={self.fps} and video.gop={self.gop} must be positive.")
+        require(self.fps >= 1 and self.gop >= 1, f"fps={self.fps} and video.gop={self.gop} must be positive.")
 
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
@@ -172,8 +162,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     A run that was interrupted is continued by calling again with the same arguments. The files are told by their
     content, so one that has changed since is noticed.
     """
-    if not episodes:
-        raise UserError("There is no episode to convert.")
+    require(episodes, "There is no episode to convert.")
     options = replace(options or ConvertOptions(), **recorded_options(episodes))
     plan = _plan(episodes, options)
     partial = _work_folder(output)
@@ -224,7 +213,14 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
 def _convert(
     episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
 ) -> int:
-    _claim(partial, plan)
+    require(
+        claim_plan(partial, plan),
+        f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
+        "that one to finish it, choose another output, or remove that folder yourself.",
+    )
+    for leftover in (partial / "writing", partial / _MERGED):
+        shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
+    (partial / _PARTS).mkdir(exist_ok=True)
     names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
     parts = [partial / _PARTS / name for name in names]
     missing = [i for i, part in enumerate(parts) if not part.is_dir()]
@@ -244,31 +240,17 @@ def _finished(output: Path, plan: dict[str, Any]) -> bool:
     if not output.exists() or (output.is_dir() and not any(output.iterdir())):
         return False
     side = output / SIDE_FILE
-    if side.is_file() and _same(read_json(side, "the facts of a converted dataset").get("plan"), plan):
-        return True
+    if side.is_file():
+        stored = read_json(side, "the facts of a converted dataset").get("plan")
+        if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
+            # Plans from before contents were compared name files and sizes only.
+            plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
+        if stored == plan:
+            return True
     raise UserError(
         f"{output} exists and is not the result of this conversion (other files, other content of a file, other "
         "episodes or options). Choose another output, or remove that folder yourself."
     )
-
-
-def _same(stored: Any, plan: dict[str, Any]) -> bool:
-    """Whether a stored plan is this one; plans from before contents were compared name files and sizes only."""
-    if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
-        plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
-    return stored == plan
-
-
-def _claim(partial: Path, plan: dict[str, Any]) -> None:
-    """Make `partial` the work folder of this plan, or recognise it as such."""
-    if not claim_plan(partial, plan):
-        raise UserError(
-            f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
-            "that one to finish it, choose another output, or remove that folder yourself."
-        )
-    for leftover in (partial / "writing", partial / _MERGED):
-        shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
-    (partial / _PARTS).mkdir(exist_ok=True)
 
 
 def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
@@ -296,6 +278,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
 
 
 def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> None:
+    import av
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -341,19 +324,10 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
     dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     for path in root.glob("videos/**/*.mp4"):
-        if (count := count_frames(path)) != episode.length:
+        with av.open(str(path)) as container:
+            count = sum(packet.size > 0 for packet in container.demux(video=0))  # without decoding
+        if count != episode.length:
             raise RuntimeError(f"{path} holds {count} frames instead of {episode.length}.")
-
-
-def count_frames(path: Path) -> int:
-    """Number of images in a video file, counted without decoding."""
-    import av
-
-    container = av.open(str(path))
-    try:
-        return sum(packet.size > 0 for packet in container.demux(video=0))
-    finally:
-        container.close()
 
 
 def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
@@ -364,6 +338,8 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
+    stats = merged / "meta" / "stats.json"  # LeRobot writes its keys in the order of a set, another in each process
+    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
     for i, part in enumerate(parts):
         if (part / _KEYFRAMES).is_file():
             file_of(merged, i).parent.mkdir(exist_ok=True)

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
 from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
@@ -79,18 +79,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
             seed: of all randomness.
         """
-        if memory is not None and (caches is None or len(caches) != len(sources)):
-            raise UserError(
-                "A policy with memory trains on cached vision tokens, one cache a source: build them with "
-                "`mme-vla cache model=<model> data=<data>` and pass `caches`."
-            )
+        require(
+            memory is None or (caches is not None and len(caches) == len(sources)),
+            "A policy with memory trains on cached vision tokens, one cache a source: build them with "
+            "`mme-vla cache model=<model> data=<data>` and pass `caches`.",
+        )
         if not 0 <= action_offset <= 1:
             raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
-        if processor.prompt_spec.reads_subgoal and subgoal is None:
-            raise UserError(
-                f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set subgoal_text.kind to "
-                "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain."
-            )
+        require(
+            not processor.prompt_spec.reads_subgoal or subgoal is not None,
+            f"The prompt format {processor.prompt_spec.name!r} reads a subgoal: set subgoal_text.kind to "
+            "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain.",
+        )
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
         self.sources, self.processor, self.memory = list(sources), processor, memory
@@ -102,11 +102,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
         pairs = zip(self._source, self._episode, strict=True)
         self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
-        if not self.steps:
-            raise UserError("The data hold no execution step of this robot.")
+        require(self.steps, "The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
-        """Number of items: one a step."""
         return self.steps
 
     @property
@@ -130,7 +128,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.epoch = epoch
 
     def locate(self, index: int) -> tuple[int, int, int]:
-        """Return (source, episode, frame) of an item."""
         if not 0 <= index < self.steps:
             raise IndexError(f"step {index} of {self.steps}")
         at = int(np.searchsorted(self._ends, index, side="right"))
@@ -238,11 +235,11 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:
     for source in sources:
         lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
-        if lacking:
-            raise UserError(
-                f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
-                f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}."
-            )
+        require(
+            not lacking,
+            f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
+            f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}.",
+        )
 
 
 class GroupDataset(TrainingDataset):
@@ -253,7 +250,6 @@ class GroupDataset(TrainingDataset):
     """
 
     def __len__(self) -> int:
-        """Number of groups in an epoch."""
         episodes = len(self._episode)
         return episodes * max(round(self.steps / (episodes * self.processor.samples.group_size)), 1)
 

@@ -36,7 +36,7 @@ from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.utils import Sums, decoding, read_json
 
 SIDE_FILE = "meta/robomme_episodes.json"
@@ -92,7 +92,10 @@ class EpisodeSource:
         self.lossy = {name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))}
         """Of cameras whose videos lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
-        self._check_tables()
+        # What every opening reads anyway; tables that hold images are left to `verify`.
+        opened = ("meta/", "data/") if len(videos) == len(self.columns) else ("meta/",)
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        sums.check(*(name for name in sums.table if name.startswith(opened)))
         episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
         self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
         self._goals = list(episodes["goals"])
@@ -113,7 +116,6 @@ class EpisodeSource:
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
     def __len__(self) -> int:
-        """Number of episodes."""
         return len(self.lengths)
 
     def __repr__(self) -> str:
@@ -156,16 +158,8 @@ class EpisodeSource:
             The number of files compared, 0 for a dataset that was written without checksums.
         """
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        for name in sums.table:
-            sums.check(name)
+        sums.check(*sums.table)
         return len(sums.table)
-
-    def _check_tables(self) -> None:
-        """The same for what every opening reads anyway; tables that hold images are left to `verify`."""
-        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
-        for name in sums.table:
-            if name.startswith("meta/") or (name.startswith("data/") and len(self.video_cameras) == len(self.columns)):
-                sums.check(name)
 
     def goal(self, episode: int) -> str:
         """The episode's goal in words, lower-case."""
@@ -176,11 +170,11 @@ class EpisodeSource:
         letters = len(self.robot.action.choice)
         if not letters:
             return ()
-        if episode >= len(self.records) or "options" not in self.records[episode]:
-            raise UserError(
-                f"{self.root / SIDE_FILE} does not say which options episode {episode} offered, and the robot "
-                f"{self.robot.name!r} chooses among them. Convert or record the dataset again."
-            )
+        require(
+            episode < len(self.records) and "options" in self.records[episode],
+            f"{self.root / SIDE_FILE} does not say which options episode {episode} offered, and the robot "
+            f"{self.robot.name!r} chooses among them. Convert or record the dataset again.",
+        )
         return read_options(self.records[episode]["options"], letters)
 
     def states(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
@@ -281,8 +275,7 @@ class EpisodeSource:
         if not len(indices) or indices.min() < 0 or indices.max() >= length:
             raise UserError(f"{self.name}, episode {episode}: frames {indices.tolist()[:5]} asked of {length}.")
         camera = self.robot.memory_camera if camera is None else camera
-        if camera not in self.columns:
-            raise UserError(f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
+        require(camera in self.columns, f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
         if not (rendered := self.rendered(episode, camera)[indices]).all():
             raise UserError(
                 f"{self.name}, episode {episode}: {camera} was not rendered at frames "
@@ -321,11 +314,11 @@ class EpisodeSource:
         index = _flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
         total = int(self.lengths.sum())  # before anything of that size is made
         expected = np.repeat(np.arange(len(self)), self.lengths) if len(index) == total else None
-        if expected is None or not np.array_equal(index.to_numpy(zero_copy_only=False), expected):
-            raise UserError(
-                f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total} in "
-                f"{len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or convert it again."
-            )
+        require(
+            expected is not None and np.array_equal(index.to_numpy(zero_copy_only=False), expected),
+            f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total} in "
+            f"{len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or convert it again.",
+        )
 
     def _read_exec_starts(self, columns: Sequence[str], side_file: Path | None) -> np.ndarray:
         if side_file is not None:

@@ -4,7 +4,7 @@
 is found among them by its goal, its length and its joint angles.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import listed, require
 
 NEAR = 0.05  # radians on average: a demonstration that was made anew differs a little, another episode by far more
 _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
@@ -36,42 +36,35 @@ def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
     """All episodes, in order, of official HDF5 files or their folders, and of LeRobot datasets that mark the video."""
     episodes: list[AnnotatedEpisode] = []
     for path in inputs:
-        annotated = _of_dataset(Path(path)) if (Path(path) / "meta").is_dir() else _of_files(path)
-        episodes += annotated
+        if (Path(path) / "meta").is_dir():
+            source = EpisodeSource(path)
+            for e, start in enumerate(source.exec_starts.tolist()):
+                episodes.append(AnnotatedEpisode((source.goal(e),), source.states(e)[:, :ARM_JOINTS], start))
+            continue
+        for ref in list_episodes(find_files([path])):
+            with open_episode(ref) as episode:
+                joints = episode.joints()[0].astype(np.float32)
+                episodes.append(AnnotatedEpisode(tuple(episode.goals), joints, episode.exec_start))
     return episodes
-
-
-def _of_dataset(root: Path) -> Iterator[AnnotatedEpisode]:
-    source = EpisodeSource(root)
-    for episode in range(len(source)):
-        joints = source.states(episode)[:, :ARM_JOINTS]
-        yield AnnotatedEpisode((source.goal(episode),), joints, int(source.exec_starts[episode]))
-
-
-def _of_files(path: str | Path) -> Iterator[AnnotatedEpisode]:
-    for ref in list_episodes(find_files([path])):
-        with open_episode(ref) as episode:
-            yield AnnotatedEpisode(tuple(episode.goals), episode.joints()[0].astype(np.float32), episode.exec_start)
 
 
 def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> list[int]:
     """The first execution frame of every episode of a dataset that does not mark its videos."""
     source = EpisodeSource(dataset, robot=_UNMARKED)
-    return [_start_of(source, episode, annotated) for episode in range(len(source))]
-
-
-def _start_of(source: EpisodeSource, episode: int, annotated: Sequence[AnnotatedEpisode]) -> int:
-    goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
-    alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
-    apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
-    nearest = min(apart, default=np.inf)
-    starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
-    if nearest > NEAR:
+    matches = []
+    for episode in range(len(source)):
+        goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
+        alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
+        apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
+        nearest = min(apart, default=np.inf)
+        starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
         near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
-        raise UserError(
-            f"{source.root}, episode {episode} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} "
-            f"episodes given: {near}. Give the recordings that the dataset was made from, all of them."
+        place = f"{source.root}, episode {episode}"
+        require(
+            nearest <= NEAR,
+            f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes given: {near}. Give "
+            "the recordings that the dataset was made from, all of them.",
         )
-    if len(starts) > 1:
-        raise UserError(f"{source.root}, episode {episode}: recordings that fit alike begin at {listed(starts)}.")
-    return starts[0]
+        require(len(starts) <= 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
+        matches.append(starts[0])
+    return matches

@@ -18,7 +18,7 @@ from h5py import Empty, h5d, h5s
 from mme_vla.data.waypoints import CHOICE_NUMBERS, known_poses, row_of
 from mme_vla.embodiment.action_space import POSE_WIDTH, read_options
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.utils import decoding, parse_json, require_file
 
 REMEDY = "Download or copy the file again."
@@ -81,19 +81,20 @@ class RawEpisode:
         self.ref, self._group = ref, group
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
             steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name))
-        if steps != list(range(len(steps))) or not steps:
-            raise UserError(
-                f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
-                f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged."
-            )
+        require(
+            steps == list(range(len(steps))) and steps,
+            f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
+            f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged.",
+        )
         self.length = len(steps)
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
             # A recording at a chosen list of frames has images at these alone.
             image_keys = () if FRAMES in group else _IMAGE_KEYS.values()
             needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*image_keys, *_REQUIRED)))
             missing = [name for name in needed if name not in group]
-        if missing:
-            raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
+        require(
+            not missing, f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder."
+        )
         demo = np.array([self._flag(k, "info/is_video_demo") for k in range(self.length)])
         self.exec_start = int(demo.sum())
         if demo[self.exec_start :].any() or self.exec_start == self.length:
@@ -121,7 +122,6 @@ class RawEpisode:
         return array
 
     def _numbers(self, step: int, name: str, count: int, finite: bool = True) -> np.ndarray:
-        """The first `count` numbers of a step."""
         valid = self._checked(
             f"timestep_{step}/{name}",
             lambda x: x.ndim <= 1 and x.size >= count and (not finite or bool(np.isfinite(x).all())),
@@ -250,8 +250,7 @@ class RawEpisode:
         parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
                  "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
         missing = [name for name in parts.values() if name not in self._group]
-        if missing:
-            raise UserError(f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
+        require(not missing, f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
         shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
         arrays: dict[str, np.ndarray] = {"colours": colours}
         for name, shape in shapes.items():
@@ -273,13 +272,11 @@ class RawEpisode:
         return bool(self._numbers(step, "action/joint_action", 8)[7] > 0)
 
     def front(self, step: int) -> np.ndarray:
-        """The front image of one step, [H, W, 3] uint8."""
         return self._image(step, "front")
 
     def __iter__(self) -> Iterator[RawFrame]:
         for camera, rendered in self.rendered.items():
-            if not rendered.any():
-                raise UserError(f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}")
+            require(rendered.any(), f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}")
         latest = {camera: self._image(int(rendered.argmax()), camera) for camera, rendered in self.rendered.items()}
         for k, subgoals in enumerate(self.subgoals()):
             fingers = self._numbers(k, "obs/gripper_state", 1)
@@ -327,8 +324,7 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
         task = re.sub(r"^record_dataset_", "", file.stem)
         with _open(file) as handle, decoding(file, "HDF5", REMEDY):
             numbers = sorted(int(name[8:]) for name in handle if re.fullmatch(r"episode_\d{1,9}", name))
-        if not numbers:
-            raise UserError(f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.")
+        require(numbers, f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.")
         refs += [EpisodeRef(file, number, task) for number in numbers]
     return refs
 
@@ -353,7 +349,6 @@ def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
 
 @contextmanager
 def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
-    """Open one episode for reading."""
     with _open(ref.file) as handle:
         with decoding(ref.file, "HDF5", REMEDY):
             group = handle.get(ref.group)

@@ -20,7 +20,7 @@ from mme_vla.data.hdf5 import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.methods.sam2act.processor import Shot
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.utils import require_file, write_atomically
@@ -104,7 +104,6 @@ class EpisodeKeyframes:
 
     @cached_property
     def motions(self) -> Motions:
-        """The episode's planned motions."""
         arrays = self._read("decisions", "targets")
         return Motions(arrays["decisions"], arrays["targets"])
 
@@ -226,18 +225,17 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
                 counted[source.task(episode)] += 1
                 shares += [1.0 if length == 1 else 1 / len(keyframes.chains)] * len(runs)
                 tasks += [source.task(episode)] * len(runs)
-        if not self._items:
-            raise UserError(
-                f"No chain of keyframes in the data has {length} of them; the longest has {longest}. Train on longer "
-                "tasks, or remember fewer (backbone.remembered)."
-            )
+        require(
+            self._items,
+            f"No chain of keyframes in the data has {length} of them; the longest has {longest}. Train on longer "
+            "tasks, or remember fewer (backbone.remembered).",
+        )
         if length == 1:
             counted = Counter(tasks)
         chances = np.array(shares) / [counted[task] for task in tasks]
         self._sample_thresholds = np.cumsum(chances / chances.sum())
 
     def __len__(self) -> int:
-        """Number of samples."""
         return len(self._items)
 
     def set_epoch(self, epoch: int) -> None:

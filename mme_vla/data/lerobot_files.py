@@ -17,7 +17,7 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Camera, Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
@@ -33,7 +33,7 @@ NAMES: Mapping[str, Mapping[str, str]] = {
     },
 }
 """Spellings of a dataset's columns, each by how it differs from the released datasets'."""
-_DEFAULT_COLUMNS = {"state": ("observation.state",), "action": ("action", "actions")}
+_ACTION = ("action", "actions")
 
 
 @dataclass(frozen=True)
@@ -55,31 +55,30 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     """Match a robot with a dataset."""
     matches = {
         **{camera.name: _first(_spellings_of(camera), features) for camera in robot.cameras},
-        **{key: _first((key, f"observation.{key}"), features) for key in robot.state.key},
-        **{key: _first((key, *_also(key)), features) for key in robot.action.key},
-        **{key: _first((key, f"observation.{key}"), features) for key in robot.action.pose_key},
+        **{key: _first((key, f"observation.{key}"), features) for key in (*robot.state.key, *robot.action.pose_key)},
+        **{key: _first((key, *(_ACTION if key in _ACTION else ())), features) for key in robot.action.key},
     }
     if not robot.state.key:
         matches["state"] = _first(("observation.state", "state"), features)
     if not robot.action.key:
-        matches["action"] = _first(("action", "actions"), features)
+        matches["action"] = _first(_ACTION, features)
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
     missing = [keys.get(name, name) for name, column in matches.items() if column is None]
-    if missing:
-        raise UserError(
-            f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
-            f"These are the names of the robot {robot.name!r}: choose embodiment=<the robot this dataset is of>, or "
-            "name its columns in a configs/embodiment file of your own. (RoboMME's poses and waypoints are columns of "
-            "datasets that this library converts or records.)"
-        )
+    require(
+        not missing,
+        f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
+        f"These are the names of the robot {robot.name!r}: choose embodiment=<the robot this dataset is of>, or "
+        "name its columns in a configs/embodiment file of your own. (RoboMME's poses and waypoints are columns of "
+        "datasets that this library converts or records.)",
+    )
     columns = {name: str(column) for name, column in matches.items()}
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
-        if features[column]["dtype"] not in ("image", "video"):
-            raise UserError(
-                f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be the camera "
-                f"{name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key)."
-            )
+        require(
+            features[column]["dtype"] in ("image", "video"),
+            f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be the camera "
+            f"{name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key).",
+        )
     state = tuple(columns[key] for key in robot.state.key or ("state",))
     action = tuple(columns[key] for key in robot.action.key or ("action",))
     _check_width(root, "state", state, features, robot.state.width, robot)
@@ -120,10 +119,6 @@ def _spellings_of(camera: Camera) -> list[str]:
     return [spelling for name in names for spelling in (name, f"observation.images.{name}")]
 
 
-def _also(key: str) -> tuple[str, ...]:
-    return tuple(name for name in _DEFAULT_COLUMNS["action"] if key in _DEFAULT_COLUMNS["action"] and name != key)
-
-
 def _first(names: Iterable[str], features: Mapping[str, Any]) -> str | None:
     return next((name for name in names if name in features), None)
 
@@ -148,19 +143,19 @@ def resolve_root(root: str | Path) -> Path:
     """Return the dataset folder; `sample` names the one in the package."""
     path = SAMPLE if str(root) == "sample" else Path(root).expanduser()
     info = path / "meta" / "info.json"
-    if not info.is_file():
-        raise UserError(
-            f"No LeRobot dataset at {str(root)!r} (there is no {info}). Give its local folder, or 'sample'. From the "
-            "hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir <folder>`; from HDF5 files: "
-            "`mme-vla convert input=<files> output=<folder>`."
-        )
+    require(
+        info.is_file(),
+        f"No LeRobot dataset at {str(root)!r} (there is no {info}). Give its local folder, or 'sample'. From the "
+        "hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir <folder>`; from HDF5 files: "
+        "`mme-vla convert input=<files> output=<folder>`.",
+    )
     version = brief(read_info(path).get("codebase_version", "unknown"), quote=False)
-    if not version.startswith("v3."):
-        raise UserError(
-            f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own command: "
-            f"`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name} --root={path} "
-            "--push-to-hub=false`."
-        )
+    require(
+        version.startswith("v3."),
+        f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own command: "
+        f"`python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={path.name} --root={path} "
+        "--push-to-hub=false`.",
+    )
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet", "data/*/*.parquet"):
         if not any(path.glob(pattern)):
             raise UserError(f"{path} has no {pattern}: the dataset is incomplete. Copy, download or convert it again.")
@@ -225,10 +220,9 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
             raise UserError(f"{file} says {brief(pair[1])} of episode {brief(pair[0])}. {expected}")
     table = dict(pairs)
     lost = [episode for episode in range(episodes) if episode not in table]
-    if lost:
-        raise UserError(
-            f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all {episodes}."
-        )
+    require(
+        not lost, f"{file} covers no episode {lost[:5]}{'…' if len(lost) > 5 else ''}; it must name all {episodes}."
+    )
     return np.array([table[episode] for episode in range(episodes)], np.int64)
 
 
@@ -283,10 +277,10 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
         empty = [name for name in schema.names if table[name].null_count]
         columns = {name: table[name].to_numpy() for name, _ in fields}
         tasks = [texts[0] if texts else None for texts in table["tasks"].to_pylist()]
-    if empty or not table.num_rows:
-        raise UserError(
-            f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}. {REMEDY}"
-        )
+    require(
+        not empty and table.num_rows,
+        f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}. {REMEDY}",
+    )
     starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]
     checks = {
         "episode_index": (columns["episode_index"] == np.arange(len(starts)), "0, 1, 2, …"),
@@ -338,12 +332,13 @@ def _kind(dtype: str, shape: tuple[int, ...], **_: Any) -> Any:
 
 def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
     """Make sure that every row of a column is `width` finite numbers; one alone may stand without a list around it."""
+    import pyarrow as pa
     import pyarrow.compute as pc
 
-    first = 0
+    first, list_kinds = 0, (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
     for chunk in table.data[name].chunks:
         # Counting is not enough: rows of 7 and 9 numbers have 8 on average.
-        listed = _is_list(chunk.type)
+        listed = any(is_kind(chunk.type) for is_kind in list_kinds)
         lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False) if listed else width
         wrong = np.broadcast_to(lengths != width, len(chunk))
         if not wrong.any():
@@ -372,9 +367,3 @@ def video_file(root: Path, template: object, view: str, chunk: int, file: int) -
             f"{{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
         )
     return inside(root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video")
-
-
-def _is_list(kind: Any) -> bool:
-    import pyarrow as pa
-
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)

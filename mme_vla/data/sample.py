@@ -12,7 +12,7 @@ from pathlib import Path
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import EpisodeRef
 from mme_vla.data.lerobot_files import SAMPLE
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 # (folder, task, episode): `full` holds one episode with an image a step, `thinned` the others.
 EPISODES = (
@@ -52,8 +52,7 @@ def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
     folders = {"full": full, "thinned": thinned}
     refs = [EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task) for kind, task, number in EPISODES]
     for ref in refs:
-        if not ref.file.is_file():
-            raise UserError(f"{ref.file} does not exist; the sample needs {ref.group} of it.")
+        require(ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it.")
     convert(refs, output, OPTIONS)
     (output / "README.md").write_text(README)
     size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())

@@ -10,7 +10,7 @@ import numpy as np
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,7 @@ class Split:
 
 
 def split_episodes(
-    sources: Sequence[EpisodeSource],
-    val_fraction: float = 0.0,
-    val_episodes: Sequence[int | str] | None = None,
+    sources: Sequence[EpisodeSource], val_fraction: float = 0.0, val_episodes: Sequence[int | str] | None = None
 ) -> Split:
     """Split every source by episode.
 
@@ -33,28 +31,36 @@ def split_episodes(
     bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
     change when data are added, and needs no random numbers.
     """
-    named = _by_source(val_episodes or [], sources)
+    named: dict[str, list[int]] = {}
+    for name in val_episodes or ():
+        source_name, _, number = str(name).rpartition("/")
+        if not number.isdigit() or (not source_name and len(sources) > 1):
+            reason = ", since there are several sources." if number.isdigit() else "."
+            raise UserError(
+                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0{reason}"
+            )
+        named.setdefault(source_name or sources[0].name, []).append(int(number))
     unknown = set(named) - {source.name for source in sources}
-    if unknown:
-        raise UserError(
-            f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
-            f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[]."
-        )
-    if not 0 <= val_fraction < 1:
-        raise UserError(f"val_fraction={val_fraction} must lie in [0, 1).")
+    require(
+        not unknown,
+        f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
+        f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[].",
+    )
+    require(0 <= val_fraction < 1, f"val_fraction={val_fraction} must lie in [0, 1).")
     split = Split([], [])
     for source in sources:
         episodes = np.arange(len(source))
         if source.name in named:
             wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
-            if wrong:
-                raise UserError(
-                    f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
-                    "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1"
-                )
+            require(
+                not wrong,
+                f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
+                "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1",
+            )
             held_out = np.isin(episodes, named[source.name])
         else:
-            held_out = np.array([_fraction(f"{source.name}/{e}") < val_fraction for e in episodes], bool)
+            sums = (sha256(f"{source.name}/{e}".encode()).digest()[:8] for e in episodes)
+            held_out = np.array([int.from_bytes(number, "big") / 2**64 < val_fraction for number in sums], bool)
         split.train.append(episodes[~held_out])
         split.val.append(episodes[held_out])
     if not sum(map(len, split.train)):
@@ -65,24 +71,6 @@ def split_episodes(
 def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
     """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any other dataset."""
     return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
-
-
-def _by_source(names: Sequence[int | str], sources: Sequence[EpisodeSource]) -> dict[str, list[int]]:
-    """Group `<source>/<number>` words, or bare numbers of the only source."""
-    grouped: dict[str, list[int]] = {}
-    for name in names:
-        source, _, number = str(name).rpartition("/")
-        if not number.isdigit() or (not source and len(sources) > 1):
-            raise UserError(
-                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0"
-                + (", since there are several sources." if number.isdigit() else ".")
-            )
-        grouped.setdefault(source or sources[0].name, []).append(int(number))
-    return grouped
-
-
-def _fraction(text: str) -> float:
-    return int.from_bytes(sha256(text.encode()).digest()[:8], "big") / 2**64
 
 
 _KEYS = ("root", "name", "exec_starts")
@@ -96,16 +84,13 @@ def open_sources(
     `robot` says which columns hold its images, states and actions.
     """
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
-    if not listed:
-        raise UserError("data.sources is empty: name at least one dataset folder, or 'sample'.")
+    require(listed, "data.sources is empty: name at least one dataset folder, or 'sample'.")
     sources = []
     for entry in listed:
         options = {"root": entry} if isinstance(entry, str) else dict(entry)
         for key in options:
-            if key not in _KEYS:
-                raise UserError(f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
-        if not options.get("root"):
-            raise UserError("A data source needs its dataset folder: root=<folder>, or 'sample'.")
+            require(key in _KEYS, f"Unknown key {key!r} of a data source. {did_you_mean(str(key), _KEYS)}")
+        require(options.get("root"), "A data source needs its dataset folder: root=<folder>, or 'sample'.")
         sources.append(EpisodeSource(**options, robot=robot))
     names = [source.name for source in sources]
     if len(set(names)) < len(names):

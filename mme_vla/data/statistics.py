@@ -8,7 +8,7 @@ import torch
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
@@ -42,31 +42,25 @@ def compute_norm_stats(
         video: count the conditioning video's steps too.
     """
     steps = _counted_steps(sources, episodes, video)
-    if len(steps) < 2:
-        raise UserError(f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
+    require(len(steps) >= 2, f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
     if not every:
         np.random.default_rng(seed).shuffle(steps)
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
     states, actions = (ExactStats() if exact else RunningStats() for _ in range(2))
     with progress("statistics", batches, unit="batches") as advance:
         for i in range(batches):
-            rows = [_row(sources, step, horizon, action_offset) for step in steps[i * BATCH : (i + 1) * BATCH]]
-            state = torch.from_numpy(np.stack([row[0] for row in rows]))
-            chunk = torch.from_numpy(np.stack([row[1] for row in rows]))
+            rows = steps[i * BATCH : (i + 1) * BATCH].tolist()
+            state = torch.from_numpy(np.stack([sources[s].states(e, t, t + 1)[0] for s, e, t in rows]))
+            chunks = [sources[s].action_chunk(e, t, horizon, action_offset)[0] for s, e, t in rows]
+            chunk = torch.from_numpy(np.stack(chunks))
             states.update(state.numpy())
             actions.update(robot.action.to_relative(chunk, state).numpy())
             advance(1)
-    letters = list(robot.action.choice)
-    return NormStats(state=states.result(extremes), actions=_of_letters(actions.result(extremes), letters))
-
-
-def _of_letters(stats: QuantileStats, letters: list[int]) -> QuantileStats:
-    """Statistics in which these numbers go from 0 to 1: a letter that is seldom chosen would else have no range."""
-    values = stats.to_dict()
+    values = actions.result(extremes).to_dict()
     for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
-        for place in letters if name in values else ():
+        for place in robot.action.choice if name in values else ():  # a letter that is seldom chosen has no range
             values[name][place] = value
-    return QuantileStats.from_dict(values)
+    return NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
 
 
 def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:
@@ -78,11 +72,3 @@ def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarr
             step = np.asarray(every, np.int32)
             parts.append(np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1))
     return np.concatenate(parts)
-
-
-def _row(
-    sources: Sequence[EpisodeSource], place: np.ndarray, horizon: int, offset: int
-) -> tuple[np.ndarray, np.ndarray]:
-    source, episode, step = (int(x) for x in place)
-    chunk, _ = sources[source].action_chunk(episode, step, horizon, offset)
-    return sources[source].states(episode, step, step + 1)[0], chunk

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.utils import decoding, files_to_hold
 
 _SEEK_BEYOND = 64  # images: a target further ahead than this is sought, a nearer one is decoded up to
@@ -38,8 +38,7 @@ class VideoReader:
         order = np.argsort(np.asarray(timestamps), kind="stable")
         targets = np.asarray(timestamps, np.float64)[order]
         images: list[np.ndarray] = []
-        if not path.is_file():
-            raise UserError(f"{path} is missing: the dataset is incomplete. Copy or download it again.")
+        require(path.is_file(), f"{path} is missing: the dataset is incomplete. Copy or download it again.")
         try:
             with decoding(path, "a video", "Copy or convert it again."):
                 for image in self._decode(self._container(path), targets, fps):

@@ -9,37 +9,30 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from mme_vla.config.sections import section_keys
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, check_whole, require
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
-
-
 def columns(value: Any, where: str) -> tuple[str, ...]:
     """One column of a dataset or several to be joined; none where the usual names are meant."""
     names = [] if value is None else [value] if isinstance(value, str) else value
-    if not isinstance(names, Sequence) or not all(isinstance(name, str) and name for name in names):
-        raise UserError(f"{where} must be a column of the dataset or a list of columns, got {brief(value)}.")
+    require(
+        isinstance(names, Sequence) and all(isinstance(name, str) and name for name in names),
+        f"{where} must be a column of the dataset or a list of columns, got {brief(value)}.",
+    )
     return tuple(names)
-
-
-def integer(value: Any, where: str) -> int:
-    """A positive whole number, no larger than `LARGEST`."""
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST:
-        raise UserError(f"{where} must be a positive whole number to {LARGEST}, got {brief(value)}.")
-    return value
 
 
 def column_indices(given: Any, where: str, width: int) -> tuple[int, ...]:
     """Places of numbers in a vector of `width`, each once, counted from 0."""
     numbers = [] if given is None else list(given) if isinstance(given, Sequence) else [given]
-    if not all(isinstance(i, int) and not isinstance(i, bool) and 0 <= i < width for i in numbers):
-        raise UserError(f"{where} must list numbers from 0 to {width - 1}, got {brief(given)}.")
-    if len(set(numbers)) < len(numbers):
-        raise UserError(f"{where}={brief(given)} names a number twice.")
+    require(
+        all(isinstance(i, int) and not isinstance(i, bool) and 0 <= i < width for i in numbers),
+        f"{where} must list numbers from 0 to {width - 1}, got {brief(given)}.",
+    )
+    require(len(set(numbers)) >= len(numbers), f"{where}={brief(given)} names a number twice.")
     return tuple(sorted(numbers))
 
 
@@ -59,8 +52,10 @@ def centres(value: Any, where: str, width: int) -> dict[int, float]:
 def words(value: Any, where: str, width: int, default: Sequence[str]) -> tuple[str, ...]:
     """One text for each of `width` numbers."""
     texts = list(default) if value is None else value
-    if isinstance(texts, str) or not isinstance(texts, Sequence) or len(texts) != width:
-        raise UserError(f"{where} must hold {width} texts, one a number, got {brief(value)}.")
+    require(
+        not isinstance(texts, str) and isinstance(texts, Sequence) and len(texts) == width,
+        f"{where} must hold {width} texts, one a number, got {brief(value)}.",
+    )
     return tuple(map(str, texts))
 
 
@@ -96,19 +91,22 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
     """
     known = ascii_lowercase[:letters]
     expected = f'a list of {{"label": "a", "action": "…", "need_parameter": false}}, labels {known[0]} to {known[-1]}'
-    if not isinstance(value, Sequence) or isinstance(value, str) or not 1 <= len(value) <= letters:
-        raise UserError(f"The options to choose from are {brief(value)}; expected {expected}.")
+    require(
+        isinstance(value, Sequence) and not isinstance(value, str) and 1 <= len(value) <= letters,
+        f"The options to choose from are {brief(value)}; expected {expected}.",
+    )
     options = []
     for option in value:
         right = isinstance(option, Mapping) and isinstance(option.get("action"), str)
         label = str(option.get("label")).strip().lower() if right else ""
         needs = option.get("need_parameter", False) if right else None
         wordy = right and len(option["action"]) > MOST_WORDS
-        if len(label) != 1 or label not in known or wordy or not isinstance(needs, bool):
+        if not (len(label) == 1 and label in known and not wordy and isinstance(needs, bool)):
             raise UserError(f"The option {brief(option)} cannot be chosen; expected {expected}.")
         options.append(Option(label, " ".join(option["action"].split()), needs))
-    if len({option.label for option in options}) < len(options):
-        raise UserError(f"The options {brief(value)} have a letter twice.")
+    require(
+        len({option.label for option in options}) >= len(options), f"The options {brief(value)} have a letter twice."
+    )
     return tuple(options)
 
 
@@ -172,14 +170,16 @@ class ActionSpace:
         """Read the section `embodiment.action`."""
         where = "embodiment.action"
         values = section_keys(section, where, _KEYS, required=("width",))
-        width = integer(values["width"], f"{where}.width")
-        horizon = integer(values.get("horizon", 20), f"{where}.horizon")
-        execute = integer(values.get("execute", min(16, horizon)), f"{where}.execute")
-        if execute > horizon:
-            raise UserError(f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer.")
+        width = check_whole(f"{where}.width", values["width"])
+        horizon = check_whole(f"{where}.horizon", values.get("horizon", 20))
+        execute = check_whole(f"{where}.execute", values.get("execute", min(16, horizon)))
+        require(
+            execute <= horizon, f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer."
+        )
         frames = values.get("frames", 1)
-        if frames not in (1, None):
-            raise UserError(f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion.")
+        require(
+            frames in (1, None), f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion."
+        )
         choice, point, length = _choices(values, where, width)
         return cls(
             width=width,
@@ -302,11 +302,11 @@ def numbered(width: int) -> tuple[str, ...]:
 
 
 def _require(options: Sequence[Option]) -> None:
-    if not options:
-        raise UserError(
-            "This policy chooses among options, and the episode offers none: set episode.options. The "
-            "benchmark's are info['available_multi_choices'] of the action space multi_choice."
-        )
+    require(
+        options,
+        "This policy chooses among options, and the episode offers none: set episode.options. The "
+        "benchmark's are info['available_multi_choices'] of the action space multi_choice.",
+    )
 
 
 def _of_pose(values: Mapping[str, Any], where: str, width: int) -> tuple[int, ...]:
@@ -328,9 +328,9 @@ def _choices(values: Mapping[str, Any], where: str, width: int) -> tuple[tuple[i
         raise UserError(
             f"{where}.point={brief(values.get('point'))}: expected the two numbers y, x beside the choice's."
         )
-    if len(choice) > len(ascii_lowercase) or (choice and values.get("frames", 1) is not None):
-        raise UserError(
-            f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length: frames=null."
-        )
+    require(
+        len(choice) <= len(ascii_lowercase) and (not (choice and values.get("frames", 1) is not None)),
+        f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length: frames=null.",
+    )
     length = values.get("options_length", 0)
-    return choice, point, integer(length, f"{where}.options_length") if length else 0
+    return choice, point, check_whole(f"{where}.options_length", length) if length else 0

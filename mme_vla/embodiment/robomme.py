@@ -8,7 +8,7 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import MIDDLE, ActionSpace
 from mme_vla.embodiment.robot import Camera, Embodiment, State
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 ARM_JOINTS = 7
 POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -92,11 +92,11 @@ def benchmark_state(joints: Sequence[float] | np.ndarray, fingers: Sequence[floa
 
 def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
     """Make sure that a robot can take part in the benchmark."""
-    if robot.action.space not in spaces:
-        raise UserError(
-            f"The robot {robot.name!r} cannot be evaluated on the benchmark: its action space is "
-            f"{robot.action.space!r}, not one of {', '.join(spaces)} (embodiment.action.space)."
-        )
+    require(
+        robot.action.space in spaces,
+        f"The robot {robot.name!r} cannot be evaluated on the benchmark: its action space is "
+        f"{robot.action.space!r}, not one of {', '.join(spaces)} (embodiment.action.space).",
+    )
     other = [name for name in robot.camera_names if name not in CAMERAS]
     if other or robot.state.width != ROBOMME_JOINT.state.width:
         difference = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"

@@ -10,7 +10,7 @@ from typing import Any, Self
 from mme_vla.config.sections import section_keys
 from mme_vla.embodiment import action_space
 from mme_vla.embodiment.action_space import ActionSpace
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, check_choice, check_whole, did_you_mean, require
 
 AUGMENTATIONS = ("all", "colour", "none")
 _KEYS = ("name", "cameras", "memory_camera", "state", "action", "fps", "conditioning_video")
@@ -93,12 +93,15 @@ class Embodiment:
             near = did_you_mean(str(memory_camera), names)
             raise UserError(f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}")
         state = section_keys(values["state"], "embodiment.state", ("key", "width"), required=("width",))
-        width = action_space.integer(state["width"], "embodiment.state.width")
+        width = check_whole("embodiment.state.width", state["width"])
         fps, video = values.get("fps"), values.get("conditioning_video", False)
-        if fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000):
-            raise UserError(f"embodiment.fps must be a positive number to 1000 or null, got {brief(fps)}.")
-        if not isinstance(video, bool):
-            raise UserError(f"embodiment.conditioning_video must be true or false, got {brief(video)}.")
+        require(
+            not (
+                fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000)
+            ),
+            f"embodiment.fps must be a positive number to 1000 or null, got {brief(fps)}.",
+        )
+        require(isinstance(video, bool), f"embodiment.conditioning_video must be true or false, got {brief(video)}.")
         return cls(
             name=str(values["name"]),
             cameras=cameras,
@@ -111,9 +114,10 @@ class Embodiment:
 
     def to_dict(self) -> dict[str, Any]:
         """The section that `from_dict` reads, fit for JSON."""
+        depth = {True: {"depth": True}, False: {}}  # absent in files of earlier versions
         return {
             "name": self.name,
-            "cameras": {camera.name: _described(camera) for camera in self.cameras},
+            "cameras": {c.name: {"key": c.key, "augment": c.augment, **depth[c.depth]} for c in self.cameras},
             "memory_camera": self.memory_camera,
             "state": {"key": list(self.state.key), "width": self.state.width},
             "action": self.action.to_dict(),
@@ -132,38 +136,34 @@ class Embodiment:
         Raises:
             UserError: its actions are too narrow, or its chunks have another length.
         """
-        if self.action.width > action_dim:
-            raise UserError(
-                f"The robot {self.name!r} takes {self.action.width} numbers an action, more than "
-                f"backbone.action_dim={action_dim}: raise it."
-            )
-        if self.action.horizon != horizon:
-            raise UserError(
-                f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are the same length "
-                "of a chunk: set the embodiment's, which the backbone follows."
-            )
-
-
-def _described(camera: Camera) -> dict[str, Any]:
-    depth = {"depth": True} if camera.depth else {}  # absent in files of earlier versions
-    return {"key": camera.key, "augment": camera.augment, **depth}
+        require(
+            self.action.width <= action_dim,
+            f"The robot {self.name!r} takes {self.action.width} numbers an action, more than "
+            f"backbone.action_dim={action_dim}: raise it.",
+        )
+        require(
+            self.action.horizon == horizon,
+            f"embodiment.action.horizon={self.action.horizon} and backbone.horizon={horizon} are the same length "
+            "of a chunk: set the embodiment's, which the backbone follows.",
+        )
 
 
 def _cameras(section: Any) -> tuple[Camera, ...]:
-    if not isinstance(section, Mapping) or not section:
-        raise UserError(f"embodiment.cameras must name at least one camera with its settings, got {brief(section)}.")
+    require(
+        isinstance(section, Mapping) and section,
+        f"embodiment.cameras must name at least one camera with its settings, got {brief(section)}.",
+    )
     cameras = []
     for name, settings in section.items():
         where = f"embodiment.cameras.{name}"
         options = section_keys(settings or {}, where, ("key", "augment", "depth"))
         augment, key = options.get("augment", "all"), options.get("key")
-        if augment not in AUGMENTATIONS:
-            raise UserError(f"{where}.augment={brief(augment)}. {did_you_mean(str(augment), AUGMENTATIONS)}")
-        if key is not None and not isinstance(key, str):
-            raise UserError(f"{where}.key must be a column of the dataset, got {brief(key)}.")
+        check_choice(f"{where}.augment", augment, AUGMENTATIONS)
+        require(isinstance(key, str | None), f"{where}.key must be a column of the dataset, got {brief(key)}.")
         if not isinstance(depth := options.get("depth", False), bool):
             raise UserError(f"{where}.depth must be true or false, got {brief(depth)}.")
-        if name == "state":
-            raise UserError(f"{where}: the state goes under this name in messages; call the camera something else.")
+        require(
+            name != "state", f"{where}: the state goes under this name in messages; call the camera something else."
+        )
         cameras.append(Camera(str(name), key, augment, depth))
     return tuple(cameras)

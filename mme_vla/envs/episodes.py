@@ -6,7 +6,7 @@ from typing import Any
 
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, check_known, require
 from mme_vla.registry import TASKS
 
 ALL = "all"
@@ -24,10 +24,9 @@ def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
     names = [str(name).strip() for name in names]
     names = list(TASK_NAMES) if names == [ALL] else names
     for name in names:
-        if name not in TASK_NAMES and name not in TASKS:
-            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, *TASKS, ALL])}")
-    if not names or len(set(names)) < len(names):
-        raise UserError(f"tasks={tasks} must name each task once, and at least one.")
+        check_known("task", name, [*TASK_NAMES, *TASKS, ALL])
+    once = names and len(set(names)) == len(names) and ALL not in names
+    require(once, f"tasks={tasks} must name each task once, and at least one.")
     return names
 
 
@@ -42,17 +41,16 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     if episodes is None or episodes == ALL:
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
-        if not 1 <= episodes <= count:
-            alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
-            raise UserError(f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}")
+        alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
+        first = f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}"
+        require(1 <= episodes <= count, first)
         return list(range(episodes))
     ranges = spans(episodes, "episodes", GRAMMAR)
-    for span in ranges:
-        if span.stop > count:
-            raise UserError(f"There is no episode {span.stop - 1} in {what}, which has {count}: 0 to {count - 1}.")
+    last = max((span.stop for span in ranges), default=0) - 1
+    require(last < count, f"There is no episode {last} in {what}, which has {count}: 0 to {count - 1}.")
     numbers = [number for span in ranges for number in span]
-    if not numbers or len(set(numbers)) < len(numbers):
-        raise UserError(f"episodes={episodes} must name each episode once, and at least one.")
+    once = numbers and len(set(numbers)) == len(numbers)
+    require(once, f"episodes={episodes} must name each episode once, and at least one.")
     return numbers
 
 
@@ -68,11 +66,10 @@ def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, spli
 def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     """The value of `tasks=`, or of `task=`, which means the same."""
     tasks, task = (config.get(key) for key in ("tasks", "task"))
-    if task is not None and tasks not in (None, ALL, task):
-        raise UserError(f"tasks={tasks} and task={task} mean the same: give one of them.")
-    names = tasks if task is None else task
-    if names is None:
-        raise UserError("Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
+    one = task is None or tasks in (None, ALL, task)
+    require(one, f"tasks={tasks} and task={task} mean the same: give one of them.")
+    names: Any = tasks if task is None else task
+    require(names is not None, "Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
     return names if isinstance(names, str) else [str(name) for name in names]
 
 
@@ -82,21 +79,13 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
     Args:
         key, grammar: for messages.
     """
-    if isinstance(value, str):
-        parts: list[Any] = value.split(",")
-    elif isinstance(value, Sequence):
-        parts = list(value)
-    else:
-        raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
-    return [_span(part, value, key, grammar) for part in parts]
-
-
-def _span(part: Any, value: Any, key: str, grammar: str) -> range:
-    """The numbers of one part: a number, or `first-last`, both included."""
-    match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
-    if match is None or isinstance(part, bool | float):
-        raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
-    first, last = int(match[1]), int(match[2] or match[1])
-    if first > last:
-        raise UserError(f"{key}={value}: the range {part} ends before it begins.")
-    return range(first, last + 1)
+    parts = value.split(",") if isinstance(value, str) else value if isinstance(value, Sequence) else [None]
+    ranges = []
+    for part in parts:
+        match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
+        if match is None or isinstance(part, bool | float):
+            raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
+        first, last = int(match[1]), int(match[2] or match[1])
+        require(first <= last, f"{key}={value}: the range {part} ends before it begins.")
+        ranges.append(range(first, last + 1))
+    return ranges

@@ -29,7 +29,7 @@ from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD, REWARDS
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, check_known, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.subtasks import SubTask
@@ -39,8 +39,8 @@ log = logging.getLogger(__name__)
 
 FrameHook = Callable[[dict[str, Any], dict[str, Any], bool], None]
 """Called with each returned frame, its info, and whether it belongs to the conditioning video."""
-_MARGIN = 2  # The benchmark counts two steps more than its limit.
 _CLOSED = "The environment is closed; make a new one."
+_MARGIN = 2  # The benchmark counts two steps more than its limit.
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,7 @@ class EpisodeState:
         names = [field.name for field in fields(self) if field.name not in ("options", "actions")]
         pairs = [(name, getattr(self, name), getattr(other, name)) for name in names]
         differences = ", ".join(f"{name} {value!r} (here {here!r})" for name, value, here in pairs if value != here)
-        if differences:
-            raise UserError(f"This state is of another environment: {differences}. Make one of the same episode.")
+        require(not differences, f"This state is of another environment: {differences}. Make one of the same episode.")
 
 
 @dataclass
@@ -133,10 +132,9 @@ class RoboMMEEnv(gymnasium.Env):
         render: bool = True,
         reward: str = "none",
     ) -> None:
-        if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-            raise UserError(f"max_steps is {max_steps!r}; expected a positive integer.")
-        if reward not in REWARDS:
-            raise UserError(f"Unknown reward {reward!r}. {did_you_mean(str(reward), REWARDS)}")
+        is_count = type(max_steps) is int and max_steps >= 1
+        require(is_count, f"max_steps is {max_steps!r}; expected a positive integer.")
+        check_known("reward", reward, REWARDS)
         self._space, self._total_reward = action_space(action), REWARDS[reward]
         self.include = include or Include()
         self.max_steps = max_steps
@@ -172,8 +170,8 @@ class RoboMMEEnv(gymnasium.Env):
         """
         task = self.task
         options = {"video": True} | (options or {})
-        if len(options) > 1:
-            raise UserError(f"Unknown reset options {sorted(options.keys() - {'video'})}; there is only 'video'.")
+        others = sorted(options.keys() - {"video"})
+        require(not others, f"Unknown reset options {others}; there is only 'video'.")
         super().reset(seed=seed)
         # Leftovers of an episode, in the solver and in what the script added, go only with the scene.
         self._muted = True
@@ -207,15 +205,21 @@ class RoboMMEEnv(gymnasium.Env):
         run.actions.append(deepcopy(action))
         try:
             self._space.act(run.control, action)
-            reward = self._reward(run)
+            before = run.total_reward
+            run.total_reward = self._total_reward(self.task.progress, bool(run.info.get("success", False)))
+            reward = torch.tensor(run.total_reward - before)
             if run.frames and run.terminated:
-                self._settle()
+                # Repeat the last action once without a frame, as the benchmark does at the end of an episode.
+                self._muted = True
+                self.task.step(run.last_action)
         except UnreachableError as error:
             return {}, 0.0, True, False, {"status": "error", "error_message": str(error)}
         except Exception as error:  # the official contract: whatever goes wrong is a status
             log.debug("step failed", exc_info=True)
             info = {"status": "error", "error_message": str(error), "exception_type": type(error).__name__}
             return None, 0.0, True, False, info
+        finally:
+            self._muted = False
         observation = as_lists(run.frames, self._keys)
         return observation, reward, run.terminated, run.truncated, dict(run.info)
 
@@ -256,8 +260,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """The newest front image [256, 256, 3]; None if it was not rendered, or before the first reset."""
-        if self._task is None:
-            raise UserError(_CLOSED)
+        require(self._task is not None, _CLOSED)
         return None if self._run is None else self._run.newest.get("front_rgb")
 
     def close(self) -> None:
@@ -327,30 +330,12 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _demonstrate(self, subtask: "SubTask") -> None:
         """Carry out a sub-task of the video, evaluating before and after it as at recording."""
-        self._evaluate()
+        self.task.evaluate_planned()
         try:
             subtask.run(self._require_run().control.demonstrator)
         except PlanningError as error:  # the benchmark continues with the rest of the video
             log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
-        self._evaluate()
-
-    def _evaluate(self) -> None:
-        self.task.evaluate()
-        self.task.progress.planned = self.task.progress.index
-
-    def _settle(self) -> None:
-        """Repeat the last action once without a frame, as the benchmark does at the end of an episode."""
-        self._muted = True
-        try:
-            self.task.step(self._require_run().last_action)
-        finally:
-            self._muted = False
-
-    def _reward(self, run: _Run) -> torch.Tensor:
-        """Increase of the return in the present step."""
-        success = bool(run.info.get("success", False))
-        before, run.total_reward = run.total_reward, self._total_reward(self.task.progress, success)
-        return torch.tensor(run.total_reward - before)
+        self.task.evaluate_planned()
 
     # Info and status ---------------------------------------------------------------------------------------------
 
@@ -361,7 +346,7 @@ class RoboMMEEnv(gymnasium.Env):
         info: dict[str, Any] = {
             "task_goal": list(task.goals()),
             "simple_subgoal_online": subtask.text,
-            "status": self._status(run, bool(success), bool(fail)),
+            "status": "success" if success else "fail" if fail else "timeout" if self._timed_out(run) else "ongoing",
             "success": success,
             "fail": fail,
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
@@ -378,11 +363,6 @@ class RoboMMEEnv(gymnasium.Env):
             if getattr(self.include, f"{name}_camera_intrinsic"):
                 info[f"{name}_camera_intrinsic"] = INTRINSIC.copy()
         return info
-
-    def _status(self, run: _Run, success: bool, fail: bool) -> str:
-        if success or fail:
-            return "success" if success else "fail"
-        return "timeout" if self._timed_out(run) else "ongoing"
 
     def _timed_out(self, run: _Run) -> bool:
         return run.count >= self.max_steps + _MARGIN

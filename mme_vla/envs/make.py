@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.envs import metadata
-from mme_vla.envs.metadata import TASK_NAMES, read_variant
+from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
 from mme_vla.envs.observations import Include
-from mme_vla.errors import UserError, did_you_mean, missing_extra
+from mme_vla.errors import check_known, missing_extra, require
 from mme_vla.registry import TASKS
 
 if TYPE_CHECKING:
@@ -61,18 +61,15 @@ def make_env(
 
     Returns:
         The environment; call `reset()` first. Close it when done.
-
-    Raises:
-        UserError: an unknown name, episode or option, a missing package, or no Vulkan driver.
     """
     check_names(task, env, action_space, difficulty, seed)
     check_sessions(split, sessions)
     if env == "official":
-        if seed is not None or recovery is not None or not render or reward != "none":
-            raise UserError(
-                'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, '
-                "render, reward."
-            )
+        require(
+            seed is None and recovery is None and render and reward == "none",
+            'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, render, '
+            "reward.",
+        )
         return make_official_env(task, split, episode, action_space, max_steps, include)
     variant: dict[str, Any] = {}
     if seed is None:
@@ -80,33 +77,39 @@ def make_env(
         seed, difficulty = spec.seed, spec.difficulty
         varied = metadata.check_split(split)
         variant = {} if varied is None else varied.options
-    return _make_library_env(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
-                     recovery=recovery, **variant)  # fmt: skip
+    if action_space == "multi_choice":
+        # A policy that chooses a pixel needs the front camera's matrices.
+        include = include | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
+    included = Include.from_options(include)
+    obs_mode = ("rgb+depth+segmentation" if render else "state_dict") if included.maniskill_obs else "none"
+    require_simulator()
+    from mme_vla.envs.interface import RoboMMEEnv
+
+    scene = {"seed": seed, "difficulty": difficulty, "recovery": recovery, **variant}
+    return RoboMMEEnv(make_task(task, render=render, obs_mode=obs_mode, **scene), action_space, max_steps, included,
+                      render, reward)  # fmt: skip
 
 
 def check_sessions(split: str, sessions: int) -> None:
     """Refuse a split with sessions before each episode unless the caller shows them."""
     variant = read_variant(split)
     required = 0 if variant is None else variant.sessions
-    if required != sessions:
-        raise UserError(
-            f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
-            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
-            "callers declare them: make_env(…, sessions=2)."
-        )
+    require(
+        required == sessions,
+        f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
+        "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
+        "callers declare them: make_env(…, sessions=2).",
+    )
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
     """Refuse what can be refused without the simulator."""
-    if task not in TASK_NAMES and task not in TASKS:
-        raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
-    for kind, value, known in (("environment", env, ENVS), ("action space", action_space, ACTION_SPACES)):
-        if value not in known:
-            raise UserError(f"Unknown {kind} {value!r}. {did_you_mean(str(value), known)}")
-    if difficulty is not None and difficulty not in _DIFFICULTIES:
-        raise UserError(f"Unknown difficulty {difficulty!r}. {did_you_mean(str(difficulty), _DIFFICULTIES)}")
-    if difficulty is not None and seed is None:
-        raise UserError("A difficulty needs a seed: an episode of a split has its own.")
+    check_task_name(task)
+    check_known("environment", env, ENVS)
+    check_known("action space", action_space, ACTION_SPACES)
+    if difficulty is not None:
+        check_known("difficulty", difficulty, _DIFFICULTIES)
+        require(seed is not None, "A difficulty needs a seed: an episode of a split has its own.")
 
 
 def require_simulator() -> None:
@@ -149,23 +152,6 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
     return TASKS[task](obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options)
 
 
-def _make_library_env(
-    task: str, space: str, max_steps: int, render: bool, reward: str, options: dict[str, Any], **scene: Any
-) -> "RoboMMEEnv":
-    if space == "multi_choice":
-        # A policy that chooses a pixel needs the front camera's matrices.
-        options = options | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
-    include = Include.from_options(options)
-    obs_mode = "none"
-    if include.maniskill_obs:
-        obs_mode = "rgb+depth+segmentation" if render else "state_dict"
-    require_simulator()
-    from mme_vla.envs.interface import RoboMMEEnv
-
-    built = make_task(task, render=render, obs_mode=obs_mode, **scene)
-    return RoboMMEEnv(built, space, max_steps, include, render, reward)
-
-
 class OfficialEnv:
     """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
 
@@ -196,8 +182,7 @@ class OfficialEnv:
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Perform one action."""
         env = self._open()
-        if not self._started:
-            raise UserError("step() before reset(): call reset() first.")
+        require(self._started, "step() before reset(): call reset() first.")
         observation, reward, terminated, truncated, info = env.step(action)
         self._keep_newest(observation)
         return observation, reward, terminated, truncated, _flat(info)
@@ -214,8 +199,7 @@ class OfficialEnv:
             self._env = None
 
     def _open(self) -> Any:
-        if self._env is None:
-            raise UserError("The environment is closed; make a new one.")
+        require(self._env is not None, "The environment is closed; make a new one.")
         return self._env
 
     def _keep_newest(self, observation: Any) -> None:
@@ -228,23 +212,23 @@ def make_official_env(
 ) -> OfficialEnv:
     """Make an episode of the official package."""
     include = Include.from_options(options)
-    if find_spec("robomme") is None:
-        raise UserError(
-            "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
-            "environment of its own: it needs numpy < 2 and gymnasium 0.29. Or use env='mme_vla', which needs none."
-        )
-    if hasattr(import_module("robomme"), "STANDS_IN"):
-        raise UserError(
-            "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those "
-            "of env='mme_vla'. Uninstall it and install the official one, or leave out env='official'."
-        )
+    require(
+        find_spec("robomme") is not None,
+        "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
+        "environment of its own: it needs numpy < 2 and gymnasium 0.29. Or use env='mme_vla', which needs none.",
+    )
+    require(
+        not hasattr(import_module("robomme"), "STANDS_IN"),
+        "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those of "
+        "env='mme_vla'. Uninstall it and install the official one, or leave out env='official'.",
+    )
     import_module("robomme.robomme_env")  # registers the tasks
     builder = import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder(
         env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps
     )
     count = builder.get_episode_num()
-    if not 0 <= episode < count:
-        raise UserError(f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
+    exists = 0 <= episode < count
+    require(exists, f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
     flags = {name: True for name, yes in include.options.items() if yes}
     return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags), max_steps, include)
 

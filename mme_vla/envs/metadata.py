@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
 from mme_vla.utils import read_json
 
@@ -73,14 +73,12 @@ class Variant:
 
     def check(self, task: str) -> None:
         """Make sure that a task of the benchmark can be varied so."""
-        if task not in TASK_NAMES:
-            raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
-        if self.dial and self.dial != SESSIONS and task not in DIALS[self.dial]:
-            dials = [dial for dial, tasks in DIALS.items() if task in tasks]
-            raise UserError(
-                f"{task} has no dial {self.dial!r}; it has {', '.join(dials) or 'none'}. {self.dial} is for "
-                f"{', '.join(DIALS[self.dial])}."
-            )
+        alone = f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none."
+        require(task in TASK_NAMES, alone)
+        if self.dial and self.dial != SESSIONS:
+            dials = ", ".join(dial for dial, tasks in DIALS.items() if task in tasks) or "none"
+            which = f"it has {dials}. {self.dial} is for {', '.join(DIALS[self.dial])}."
+            require(task in DIALS[self.dial], f"{task} has no dial {self.dial!r}; {which}")
 
 
 def read_variant(split: str) -> Variant | None:
@@ -94,8 +92,7 @@ def read_variant(split: str) -> Variant | None:
         raise UserError(
             f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(known)}."
         )
-    if match[1] not in known:
-        raise UserError(f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}")
+    require(match[1] in known, f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}")
     return Variant(dial=match[1], turned=int(match[2]))
 
 
@@ -152,6 +149,11 @@ def _further_place(split: str, episode: int) -> int:
     return places[index] + round_ * len(_CYCLE)
 
 
+def check_task_name(task: str) -> None:
+    """Make sure that a task is the benchmark's or registered."""
+    check_known("task", task, dict.fromkeys([*TASK_NAMES, *TASKS]))
+
+
 def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
     """The episodes of a task in a split, in order.
 
@@ -164,8 +166,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
     """
-    if task not in TASK_NAMES and task not in TASKS:
-        raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
+    check_task_name(task)
     variant = check_split(split)
     if variant is not None:
         variant.check(task)
@@ -174,26 +175,28 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
         return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
-        return read_official(_file(Path(folder), task, split), task, split)
-    installed = _installed_folder()
-    if installed is not None and _file(installed, task, split).is_file():
-        return read_official(_file(installed, task, split), task, split)
+        return read_official(Path(folder) / split / file_name(task), task, split)
+    spec = find_spec("robomme")
+    for place in (spec.submodule_search_locations or ()) if spec is not None else ():
+        installed = Path(place) / "env_metadata" / split / file_name(task)
+        if installed.is_file():
+            return read_official(installed, task, split)
     return list(_table(split)[task])
 
 
 def check_split(split: str) -> Variant | None:
     """Make sure that a split exists; returns its variant where it has one."""
     variant = read_variant(split)
-    if variant is None and split not in _COUNTS:
-        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), [*_COUNTS, TWIN, STRESS])}")
+    if variant is None:
+        check_known("split", split, [*_COUNTS, TWIN, STRESS])
     return variant
 
 
 def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:
     """One episode of a split."""
     known = episodes(task, split, folder)
-    if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(known):
-        raise UserError(f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
+    exists = type(index) is int and 0 <= index < len(known)
+    require(exists, f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
     return known[index]
 
 
@@ -208,42 +211,30 @@ def _table(split: str) -> dict[str, list[EpisodeSpec]]:
     return table
 
 
-def _installed_folder() -> Path | None:
-    spec = find_spec("robomme")
-    folders = (spec.submodule_search_locations or []) if spec is not None else []
-    return next((Path(folder) / "env_metadata" for folder in folders), None)
-
-
-def _file(folder: Path, task: str, split: str) -> Path:
-    return folder / split / file_name(task)
-
-
 def file_name(task: str) -> str:
     """Name of the file that describes a task's episodes in the official layout."""
     return f"record_dataset_{task}_metadata.json"
 
 
-def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
-    """Episode, seed and difficulty of one official record."""
-    fields: dict[str, Any] = record if isinstance(record, dict) else {}
-    numbers: list[Any] = [fields.get("episode"), fields.get("seed")]
-    difficulty: Any = fields.get("difficulty")
-    if not all(type(n) is int and 0 <= n < 2**31 for n in numbers) or difficulty not in list(_CYCLE):
-        raise UserError(
-            f"{path} is not official metadata: a record has episode {brief(numbers[0])}, seed {brief(numbers[1])} and "
-            f"difficulty {brief(difficulty)}; expected two whole numbers and one of {', '.join(sorted(set(_CYCLE)))}. "
-            "Get the file again."
-        )
-    return numbers[0], numbers[1], difficulty
-
-
 def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
     """The episodes that an official metadata file describes, in order."""
     records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
-    if not isinstance(records, list) or not records:
-        raise UserError(f"{path} is not official metadata: it has no list of records. Get the file again.")
-    specs = [EpisodeSpec(task, split, *_numbers_of(record, path)) for record in records]
+    again = f"{path} is not official metadata: it has no list of records. Get the file again."
+    require(isinstance(records, list) and records, again)
+    specs = []
+    for record in records:
+        fields: dict[str, Any] = record if isinstance(record, dict) else {}
+        values: list[Any] = [fields.get(key) for key in ("episode", "seed", "difficulty")]
+        number, seed, difficulty = values
+        whole = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
+        require(
+            whole and difficulty in list(_CYCLE),
+            f"{path} is not official metadata: a record has episode {brief(number)}, seed {brief(seed)} and "
+            f"difficulty {brief(difficulty)}; expected two whole numbers and one of {', '.join(sorted(set(_CYCLE)))}. "
+            "Get the file again.",
+        )
+        specs.append(EpisodeSpec(task, split, number, seed, difficulty))
     specs.sort(key=lambda spec: spec.episode)
-    if [spec.episode for spec in specs] != list(range(len(specs))):
-        raise UserError(f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
+    in_order = [spec.episode for spec in specs] == list(range(len(specs)))
+    require(in_order, f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
     return specs

@@ -5,17 +5,15 @@ A frame is a dict with one value per observation key; the interface hands out li
 
 from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import check_known, require
 
 if TYPE_CHECKING:
     import gymnasium
-    import sapien
 
     from mme_vla.envs.task import Task
 
@@ -49,6 +47,7 @@ INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], 
 SENSORS = {"front": "base_camera", "wrist": "hand_camera"}
 """The benchmark's names of the cameras, and the simulator's."""
 _SCALAR_LAST = [1, 2, 3, 0]
+_OPENCV = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # from x forward, y left, z up
 _FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2])
 
 
@@ -70,10 +69,8 @@ class Include:
         """Read `include_front_depth=True` and the like."""
         known = {f"include_{field.name}" for field in fields(cls)}
         for name, value in options.items():
-            if name not in known:
-                raise UserError(f"Unknown option {name!r}. {did_you_mean(name, known)}")
-            if not isinstance(value, bool):
-                raise UserError(f"{name} is {value!r}; expected True or False.")
+            check_known("option", name, known)
+            require(isinstance(value, bool), f"{name} is {value!r}; expected True or False.")
         return cls(**{name.removeprefix("include_"): value for name, value in options.items()})
 
     @property
@@ -180,7 +177,8 @@ class Observer:
         """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
         if name == "front":
             return front_extrinsic()
-        return extrinsic_of(self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose)
+        pose = self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
+        return (_OPENCV @ np.asarray(pose.inv().to_transformation_matrix(), np.float64)[:3]).astype(np.float32)
 
     def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
@@ -205,24 +203,8 @@ def read_images(
     return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
 
 
-def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:
-    """World-to-camera matrix in OpenCV's axes (x right, y down, z forward), float32 [3, 4].
-
-    Args:
-        pose: of the camera in the world, in the simulator's axes (x forward, y left, z up).
-    """
-    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    to_camera = np.asarray(pose.inv().to_transformation_matrix(), np.float64)
-    return (axes @ to_camera[:3]).astype(np.float32)
-
-
 def front_extrinsic() -> np.ndarray:
     """World-to-camera matrix of the front camera, float32 [3, 4]; it never moves."""
-    return _front_extrinsic().copy()
-
-
-@cache
-def _front_extrinsic() -> np.ndarray:
     forward = _FRONT_TARGET - _FRONT_EYE
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 if TYPE_CHECKING:
     import sapien
@@ -33,9 +33,9 @@ def render_backend() -> str:
         summary = str(sapien.render.get_device_summary())
     except RuntimeError as error:
         raise UserError(f"This machine cannot render ({error}). {INSTALL_HINT}") from None
-    supported = [name for name, yes in devices(summary) if yes]
-    if not supported:
-        raise UserError(f"No Vulkan driver here is new enough:\n{summary.strip()}\n{INSTALL_HINT}")
+    known = re.findall(r"GPU:\s*(.+?)\s*\n\s*Supported:\s*(\d)", summary)
+    supported = [name for name, flag in known if flag == "1"]
+    require(supported, f"No Vulkan driver here is new enough:\n{summary.strip()}\n{INSTALL_HINT}")
     try:
         if sapien.Device("cuda").can_render():
             return "sapien_cuda"
@@ -43,15 +43,9 @@ def render_backend() -> str:
         logging.getLogger(__name__).debug("no CUDA device to render on")
     if all("llvmpipe" in name for name in supported):
         version = mesa_version()
-        if version is not None and version < OLDEST_MESA:
-            raise UserError(f"mesa-vulkan-drivers {version} is too old to render with. {INSTALL_HINT}")
+        is_new = version is None or version >= OLDEST_MESA
+        require(is_new, f"mesa-vulkan-drivers {version} is too old to render with. {INSTALL_HINT}")
     return "sapien_cpu"
-
-
-def devices(summary: str) -> list[tuple[str, bool]]:
-    """Name of each device in SAPIEN's summary, and whether SAPIEN supports it."""
-    matches = re.findall(r"GPU:\s*(.+?)\s*\n\s*Supported:\s*(\d)", summary)
-    return [(name, flag == "1") for name, flag in matches]
 
 
 def mesa_version() -> int | None:

@@ -12,6 +12,7 @@ no gripper number.
 """
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -24,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robot.control import GRIPPER_STEPS
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, check_known, did_you_mean, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -45,7 +46,7 @@ class Control:
     demonstrator: "Demonstrator"
 
 
-class ActionSpace:
+class ActionSpace(ABC):
     """One way to command the robot."""
 
     name: ClassVar[str]
@@ -57,6 +58,7 @@ class ActionSpace:
         """The Gymnasium space of actions."""
         return gymnasium.spaces.Box(-np.inf, np.inf, (self.width + (not stick),), np.float32)
 
+    @abstractmethod
     def act(self, control: Control, action: Any) -> None:
         """Do the control steps of one action.
 
@@ -65,7 +67,6 @@ class ActionSpace:
             UnreachableError: inverse kinematics found no joint angles.
             PlanningError: no motion to the pose was found.
         """
-        raise NotImplementedError
 
 
 class JointAngle(ActionSpace):
@@ -124,8 +125,8 @@ class MultiChoice(ActionSpace):
         return gymnasium.spaces.Dict({"choice": gymnasium.spaces.Text(1), "point": point})
 
     def act(self, control: Control, action: Any) -> None:
-        if not isinstance(action, dict) or not isinstance(action.get("choice"), str):
-            raise UserError(f'Action {action!r} is no choice; expected {{"choice": "A", "point": [y, x]}}.')
+        is_choice = isinstance(action, dict) and isinstance(action.get("choice"), str)
+        require(is_choice, f'Action {action!r} is no choice; expected {{"choice": "A", "point": [y, x]}}.')
         label = action["choice"].strip().lower()
         choices = {choice.label: choice for choice in control.task.choices()}
         if label not in choices:
@@ -137,8 +138,8 @@ class MultiChoice(ActionSpace):
             choice.run(control.demonstrator, None)
             return
         point = action.get("point")
-        if point is None or len(point) == 0:
-            raise UserError(f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object meant.")
+        needed = f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object meant."
+        require(point is not None and len(point), needed)
         pixel = _numbers(point, 2, "a pixel's row and column")
         nearest = min(choice.candidates(), key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)))
         choice.run(control.demonstrator, nearest)
@@ -151,8 +152,7 @@ SPACES: dict[str, ActionSpace] = {
 
 def action_space(name: str) -> ActionSpace:
     """The action space of that name."""
-    if name not in SPACES:
-        raise UserError(f"Unknown action space {name!r}. {did_you_mean(str(name), SPACES)}")
+    check_known("action space", name, SPACES)
     return SPACES[name]
 
 
@@ -163,11 +163,9 @@ def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.n
     except (TypeError, ValueError):
         raise UserError(f"Action {action!r} is not made of numbers; expected {size}: {meaning}.") from None
     fits = numbers.ndim == 1 and (len(numbers) == size or (longer and len(numbers) > size))
-    if not fits:
-        least = "at least " if longer else ""
-        raise UserError(f"Action has shape {numbers.shape}; expected {least}{size} numbers: {meaning}.")
-    if not np.isfinite(numbers).all():
-        raise UserError(f"Action {numbers.tolist()} holds numbers that are not finite.")
+    least = "at least " if longer else ""
+    require(fits, f"Action has shape {numbers.shape}; expected {least}{size} numbers: {meaning}.")
+    require(np.isfinite(numbers).all(), f"Action {numbers.tolist()} holds numbers that are not finite.")
     return numbers
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -186,11 +186,10 @@ class ProcessScore:
         """Read what `to_dict` made."""
         try:
             score = cls(**value)
+            is_known = score.operation in (MOTION, "", *OPERATIONS) and score.broke in (*BROKEN, "")
         except TypeError:
-            score = None
-        known = (MOTION, "", *OPERATIONS)
-        if score is None or score.operation not in known or score.broke not in (*BROKEN, ""):
-            raise UserError(f"process={brief(value)} of a record is no process score.")
+            is_known = False
+        require(is_known, f"process={brief(value)} of a record is no process score.")
         return score
 
 

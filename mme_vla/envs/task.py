@@ -13,7 +13,7 @@ from mme_vla.envs.scene.motions import Cue, build_cue, show_cue
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.stage import Stage
 from mme_vla.envs.subtasks import Choice, Progress, SubTask
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import check_known, require
 
 DIFFICULTIES = ("easy", "medium", "hard")
 RECOVERY_MODES = ("z", "xy")
@@ -30,9 +30,6 @@ class Task(Stage):
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
         second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
         does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for `recovery`.
-
-    Raises:
-        UserError: an unknown difficulty or recovery mode, a negative seed, or a dial that the task does not have.
     """
 
     shared_draws: ClassVar[bool] = False
@@ -57,20 +54,19 @@ class Task(Stage):
         in_view: bool = False,
         **kwargs: Any,
     ) -> None:
-        if seed < 0:
-            raise UserError(f"seed is {seed}; expected a non-negative integer.")
-        if difficulty is not None and difficulty not in DIFFICULTIES:
-            raise UserError(f"Unknown difficulty {difficulty!r}. {did_you_mean(str(difficulty), DIFFICULTIES)}")
+        require(seed >= 0, f"seed is {seed}; expected a non-negative integer.")
         if robomme_failure_recovery:
             recovery = robomme_failure_recovery_mode or recovery
-            if recovery is None:
-                raise UserError(f"robomme_failure_recovery needs a robomme_failure_recovery_mode of {RECOVERY_MODES}.")
-        if recovery is not None and recovery not in RECOVERY_MODES:
-            raise UserError(f"Unknown recovery mode {recovery!r}. {did_you_mean(str(recovery), RECOVERY_MODES)}")
+            needed = f"robomme_failure_recovery needs a robomme_failure_recovery_mode of {RECOVERY_MODES}."
+            require(recovery is not None, needed)
+        names = (("difficulty", difficulty, DIFFICULTIES), ("recovery mode", recovery, RECOVERY_MODES))
+        for kind, value, known in names:
+            if value is not None:
+                check_known(kind, value, known)
+        dials = f"its dials are {', '.join(sorted(self.dials)) or 'none'}, and turn up only."
         for dial, turned in (stress or {}).items():
-            if dial not in self.dials or turned < 0:
-                raise UserError(f"{type(self).__name__} cannot turn {dial!r} by {turned}: its dials are "
-                                f"{', '.join(sorted(self.dials)) or 'none'}, and turn up only.")  # fmt: skip
+            can_turn = dial in self.dials and turned >= 0
+            require(can_turn, f"{type(self).__name__} cannot turn {dial!r} by {turned}: {dials}")
         self.in_view = in_view
         self.stress = {dial: turned for dial, turned in (stress or {}).items() if turned}
         """Dials that are turned, and how far."""
@@ -184,6 +180,11 @@ class Task(Stage):
     def _show_cues(self) -> None:
         for disc, cue in self._cues:
             show_cue(disc, cue)
+
+    def evaluate_planned(self) -> None:
+        """Evaluate once before or after a sub-task's routine, where the demonstrator's pointer moves."""
+        self.evaluate()
+        self.progress.planned = self.progress.index
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Move the pointer over the sub-tasks; success and failure, each bool [1]."""

@@ -1,24 +1,21 @@
 """`evaluate` from Python: a policy on the benchmark in one call, with what the command would set."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from mme_vla.config.sections import read_section
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.make import make_env, require_simulator
-from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.feed import with_sessions
 from mme_vla.evaluation.recordings import all_recordings
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
-    checkpoint_label,
     choose_episodes,
     default_output,
-    memory_budget,
+    facts_of,
 )
 from mme_vla.evaluation.rollout.evaluation import evaluate as evaluate_run
-from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
@@ -59,41 +56,22 @@ def evaluate(
     Returns:
         The records of these episodes, and `success_rate`.
 
-    Raises:
-        UserError: a task, episode or setting that does not exist, a policy that cannot act, or a folder that holds
-            another run.
-
     >>> evaluate("outputs/framesamp_modul/latest", "StopCube", 5, seed=7).success_rate  # doctest: +SKIP
     0.4
     """
-    known = [field.name for field in fields(RolloutSettings) if field.name != "seed"]
-    if unknown := [key for key in settings if key not in known]:
-        raise UserError(f"evaluate() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
-    run_settings = RolloutSettings(seed=seed, **settings)
+    run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
     jobs = choose_episodes(tasks, episodes, run_settings.split)
     if base is make_env and run_settings.env == "mme_vla":
         require_simulator()
     loaded, source = load(policy)
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     subgoal_label = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
-    facts = RunFacts(
-        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, run_settings.split,
-        run_settings.max_steps, subgoal_label, memory_budget(loaded),
-    )  # fmt: skip
+    facts = facts_of(loaded, name, source, run_settings, subgoal_label)
     folder = default_output(facts) if output is None else Path(output).expanduser()
     donor_episodes = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
-    return evaluate_run(
-        wrapped,
-        jobs,
-        folder,
-        facts,
-        run_settings,
-        subgoals=predictor,
-        source=source,
-        base=base,
-        show_progress=show_progress,
-    )
+    options: dict[str, Any] = {"subgoals": predictor, "source": source, "base": base, "show_progress": show_progress}
+    return evaluate_run(wrapped, jobs, folder, facts, run_settings, **options)
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:

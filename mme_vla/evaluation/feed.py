@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.envs.metadata import SESSIONS, read_variant
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.base import Policy
@@ -31,11 +31,6 @@ class Feed:
     stills: int = 0
     at: int = 0
 
-    def __post_init__(self) -> None:
-        for name in ("sessions", "stills", "at"):
-            if getattr(self, name) < 0:
-                raise UserError(f"A probe cannot show {getattr(self, name)} {name}: the number must not be negative.")
-
     def repeats(self, frames: np.ndarray, exec_start: int) -> np.ndarray:
         """How often each of the episode's frames [n] is observed, int64 [n]."""
         shown = np.where((frames < exec_start) & (not self.video), 0, 1)
@@ -44,8 +39,7 @@ class Feed:
     def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
         """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is left out.
 
-        Args:
-            exec_start: the episode's first execution frame. before: frames of the sessions.
+        exec_start: the episode's first execution frame. before: frames of the sessions.
         """
         frames = np.asarray(frames, np.int64)
         video = exec_start if self.video else 0
@@ -162,8 +156,7 @@ class FedPolicy(Policy):
     def __init__(self, inner: Policy, feed: Feed, sessions: Sequence[Recording] = ()) -> None:
         """Wrap a policy.
 
-        Args:
-            sessions: recorded episodes; the first `feed.sessions` of them are observed before each episode.
+        sessions: recorded episodes; the first `feed.sessions` of them are observed before each episode.
         """
         super().__init__()
         self.inner, self.feed, self.sessions = inner, feed, list(sessions)[: feed.sessions]
@@ -233,16 +226,16 @@ def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -
     """
     variant = read_variant(split)
     if variant is None or variant.dial != SESSIONS:
-        if recordings:
-            raise UserError(f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
+        require(not recordings, f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
         return policy
     count = variant.sessions
     if not count:
         return policy
-    if policy.embodiment.readings or not recordings:
-        raise UserError(f"split={split} needs recorded episodes to take from: name them with recordings=….")
-    if count > len(recordings):
-        raise UserError(f"split={split} needs {count} recorded episodes to take from, and there are {len(recordings)}.")
+    if policy.embodiment.readings or count > len(recordings):
+        raise UserError(
+            f"split={split} needs {count} recorded episodes to take from, and there are {len(recordings)}: name them "
+            "with recordings=…."
+        )
     fed = FedPolicy(policy, Feed(sessions=count), recordings).eval()
     fed.n_distractor_episodes = count
     # The names are those of the probe's arm, so that runs of earlier versions continue.

@@ -12,8 +12,7 @@ from mme_vla.memory.base import frames_scored, past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import frames_read
 
-SUBGOAL = "simple_subgoal"
-"""The column whose changes separate sub-tasks."""
+SUBGOAL = "simple_subgoal"  # The column whose changes separate sub-tasks
 
 
 @dataclass(frozen=True)
@@ -77,9 +76,8 @@ class Recording:
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
         """Images of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
-        Args:
-            required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
-                robot that reads depth observes the frames that the dataset keeps depth of.
+        required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
+        robot that reads depth observes the frames that the dataset keeps depth of.
         """
         robot = self.source.robot
         if robot.readings:
@@ -100,8 +98,7 @@ class Recording:
     ) -> None:
         """Observe frames start … stop − 1 in a running episode.
 
-        Args:
-            required: as for `views`. video: all of it as if it were a conditioning video.
+        required: as for `views`. video: all of it as if it were a conditioning video.
         """
         if stop <= start:
             return

@@ -1,15 +1,16 @@
 """What is kept of an evaluated episode, and how records come together into runs."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
-from types import NoneType
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
-from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.config.sections import Range, read_section
+from mme_vla.errors import UserError, check_choice, require
 from mme_vla.utils import parse_json, to_line, verified
 
-_LARGEST = 2**63  # numbers from there on are damage
+Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
+Number = Annotated[float, Range(-(2.0**63), 2.0**63)]
 OUTCOMES = ("success", "fail", "timeout", "error")
 
 
@@ -45,15 +46,10 @@ class Seconds:
     policy: the episode's share of the policy's batches. total: from its beginning to its end, waiting included.
     """
 
-    sim: float = 0.0
-    policy: float = 0.0
-    total: float = 0.0
-    render: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
-                raise UserError(f"seconds.{name}={brief(value)} of a record must be a number of seconds.")
+    sim: Number = 0.0
+    policy: Number = 0.0
+    total: Number = 0.0
+    render: Number = 0.0
 
 
 @dataclass(frozen=True)
@@ -74,37 +70,26 @@ class EpisodeRecord:
     """
 
     model: str
-    checkpoint: int | str
-    model_seed: int
+    checkpoint: Whole | str
+    model_seed: Whole
     task: str
-    episode: int
-    seed: int
+    episode: Whole
+    seed: Whole
     difficulty: str
     outcome: str
-    steps: int
+    steps: Whole
     seconds: Seconds = field(default_factory=Seconds)
     error: str | None = None
     split: str = "test"
-    max_steps: int = 1300
+    max_steps: Whole = 1300
     action_space: str = "joint_angle"
     subgoal: str | None = None
-    memory_budget: int | None = None
+    memory_budget: Whole | None = None
     composition: str | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     extra: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.outcome not in OUTCOMES:
-            raise UserError(f"outcome {brief(self.outcome)} is none. {did_you_mean(str(self.outcome)[:80], OUTCOMES)}")
-        for name, kind in _KINDS.items():
-            value = getattr(self, name)
-            if not isinstance(value, kind) or isinstance(value, bool):
-                expected = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-                raise UserError(f"{name}={brief(value)} of a record must be {expected}, not {type(value).__name__}.")
-            if isinstance(value, int) and abs(value) >= _LARGEST:
-                raise UserError(f"{name}={brief(value)} of a record is out of range.")
-        if self.composition is not None and not isinstance(self.composition, str):
-            raise UserError(f"composition={brief(self.composition)} of a record must be text, or null.")
         if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
             object.__setattr__(self, "checkpoint", int(self.checkpoint))
 
@@ -134,30 +119,9 @@ class EpisodeRecord:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Read the object of a line, without its checksum."""
-        known = {member.name for member in fields(cls)}
-        unknown = sorted(set(values) - known)
-        if unknown:
-            hint = did_you_mean(unknown[0][:80], known)
-            raise UserError(f"unknown field {brief(unknown[0])}. {hint} Others go into `extra`.")
-        seconds = values.get("seconds") or {}
-        unknown = sorted(set(seconds) - set(vars(Seconds()))) if isinstance(seconds, dict) else ["seconds"]
-        lacking = sorted(member.name for member in fields(cls) if _is_required(member) and member.name not in values)
-        if unknown or lacking:
-            raise UserError(
-                f"not an episode record: {listed(lacking) or 'nothing'} is missing, {listed(unknown)} unknown"
-            )
-        return cls(**{**values, "seconds": Seconds(**seconds)})
-
-
-def _is_required(member: Field[Any]) -> bool:
-    return member.default is MISSING and member.default_factory is MISSING
-
-
-_KINDS: dict[str, Any] = {
-    "model": str, "checkpoint": (int, str), "model_seed": int, "task": str, "episode": int, "seed": int,
-    "difficulty": str, "steps": int, "split": str, "max_steps": int, "action_space": str, "when": str, "extra": dict,
-    "seconds": Seconds, "error": (str, NoneType), "subgoal": (str, NoneType), "memory_budget": (int, NoneType),
-}  # fmt: skip
+        record = read_section(cls, {**values, "seconds": values.get("seconds") or {}}, "record")
+        check_choice("record.outcome", record.outcome, OUTCOMES)
+        return record
 
 
 def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[EpisodeRecord]:
@@ -166,11 +130,9 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays. Different outcomes
     of one episode are refused: the same checkpoint and seed were evaluated twice.
 
-    Args:
-        records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
+    records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
-    if conflicts not in ("refuse", "first", "last"):
-        raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
+    check_choice("conflicts", conflicts, ("refuse", "first", "last"))
     merged: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
     for new in records:
         at = (new.run, new.key)
@@ -178,18 +140,18 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
         if old is None or (old.outcome == "error" and new.outcome != "error"):
             merged[at] = new
             continue
-        if new.seed != old.seed:
-            raise UserError(
-                f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
-                "these are not the same benchmark; evaluate both from the same episode metadata."
-            )
+        require(
+            new.seed == old.seed,
+            f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
+            "these are not the same benchmark; evaluate both from the same episode metadata.",
+        )
         if new.outcome in (old.outcome, "error"):
             continue
-        if conflicts == "refuse":
-            raise UserError(
-                f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
-                f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last."
-            )
+        require(
+            conflicts != "refuse",
+            f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
+            f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last.",
+        )
         if (conflicts == "last") == (new.when > old.when):
             merged[at] = new
     return list(merged.values())
@@ -205,11 +167,8 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     for record in records:
         if record.composition is not None:
             digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
-    only = {run: next(iter(run_digests)) for run, run_digests in digests.items() if len(run_digests) == 1}
-    return [
-        replace(record, composition=only[record.run]) if record.composition is None and record.run in only else record
-        for record in records
-    ]
+    only = {run: next(iter(of_run)) for run, of_run in digests.items() if len(of_run) == 1}
+    return [replace(r, composition=only.get(r.run)) if r.composition is None else r for r in records]
 
 
 def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:

@@ -1,7 +1,6 @@
 """The files of a run's folder: settings (`run.json`), records (`episodes.jsonl`) and claims (`claims/`)."""
 
 import fcntl
-import hashlib
 import json
 import os
 import re
@@ -16,9 +15,10 @@ from types import TracebackType
 from typing import IO, Any, Self
 from urllib.parse import quote, unquote
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.naming import digest, flat
+from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compositions, finished
 from mme_vla.utils import (
     draft_of,
@@ -40,15 +40,14 @@ INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base
 
 def fingerprint(settings: Mapping[str, Any]) -> str:
     """SHA-256 of the settings, whatever the order of their keys."""
-    return hashlib.sha256(json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return digest(settings, 64)
 
 
 def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Begin a run in `folder`, or continue with the one that is there.
 
-    Args:
-        settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, …
-        notes: what does not (device, workers, versions); written down when the run begins, never compared.
+    settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, … notes: what
+    does not (device, workers, versions); written down when the run begins, never compared.
 
     Returns:
         What `run.json` holds. Several shards may claim the same folder at once: the first writes it.
@@ -79,13 +78,11 @@ def read_run(folder: Path) -> dict[str, Any]:
     """Read a folder's `run.json`."""
     path = folder / RUN_FILE
     content = read_json(path, "a run's settings", finite=False)
-    if not isinstance(content.get("settings"), dict) or not isinstance(content.get("fingerprint"), str):
-        raise UserError(
-            f"{path} is damaged: it lacks settings or their fingerprint; remove it if the records beside "
-            "it are of this run."
-        )
-    if content["fingerprint"] != fingerprint(content["settings"]):
-        raise UserError(f"{path} was changed manually: its settings do not have its fingerprint.")
+    require(
+        content.get("fingerprint") == fingerprint(content.get("settings", {})),
+        f"{path} is damaged or was changed manually: its settings do not have its fingerprint. Remove it if the "
+        "records beside it are of this run.",
+    )
     return verified(content, str(path))
 
 
@@ -117,26 +114,13 @@ def _await_content(path: Path, patience: float = 2) -> None:
 
 
 def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    before, after = _flat(there), _flat(now)
-    changed = [key for key in sorted({*before, *after}) if before.get(key, _NOTHING) != after.get(key, _NOTHING)]
-    changes = (
-        f"{key} was {brief(before.get(key, 'not set'))}, is {brief(after.get(key, 'not set'))}" for key in changed
-    )
-    return "; ".join(changes)
+    pairs = {
+        key: [flat(values).get(key, "not set") for values in (there, now)] for key in sorted({*flat(there), *flat(now)})
+    }
+    return "; ".join(f"{key} was {brief(old)}, is {brief(new)}" for key, (old, new) in pairs.items() if old != new)
 
 
-_NOTHING = object()
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
-
-
-RECORDS = "episodes.jsonl"
-"""Name of a run's file; its shards are called `episodes-<shard>.jsonl`."""
+RECORDS = "episodes.jsonl"  # Name of a run's file; its shards are called `episodes-<shard>.jsonl`
 
 
 class RecordLog:
@@ -211,15 +195,11 @@ def find_records(paths: Iterable[Path]) -> list[Path]:
     """The files behind a list of files and folders; of a folder, every `episodes*.jsonl` below it."""
     files: list[Path] = []
     for path in paths:
-        if path.is_dir():
-            inside = sorted(path.rglob("episodes*.jsonl"))
-            if not inside:
-                raise UserError(f"{path} holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below.")
-            files += inside
-        elif path.is_file():
-            files.append(path)
-        else:
-            raise UserError(f"{path} does not exist: name files of episode records, or folders with {RECORDS}.")
+        inside = sorted(path.rglob("episodes*.jsonl")) if path.is_dir() else [path] * path.is_file()
+        if not inside:
+            what = f"holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below"
+            raise UserError(f"{path} {what if path.is_dir() else 'does not exist: name files of records, or folders'}.")
+        files += inside
     return list({path.resolve(): path for path in files}.values())
 
 
@@ -234,8 +214,7 @@ def _lock(file: IO[bytes], path: Path) -> None:
         return
 
 
-CLAIMS = "claims"
-"""Folder of a run's claims."""
+CLAIMS = "claims"  # Folder of a run's claims
 _CLAIM = re.compile(r"(?P<task>.+)-(?P<episode>\d+)\.(?P<number>\d+)\.json")
 _RECORDS = re.compile(r"episodes(-\d+of\d+)?\.jsonl")
 
@@ -250,13 +229,11 @@ class Claim:
 
     records: str | None
     host: str = field(default_factory=socket.gethostname)
-    process: int = field(default_factory=os.getpid)
+    process: PositiveInt = field(default_factory=os.getpid)
 
     def __post_init__(self) -> None:
         if self.records is not None and not _RECORDS.fullmatch(self.records):
             raise UserError(f"records={brief(self.records)} must name a file of records, such as {RECORDS}.")
-        if self.process < 1:
-            raise UserError(f"process={self.process} must be a process number.")
 
 
 class Claims:
@@ -270,8 +247,7 @@ class Claims:
     def __init__(self, folder: Path, records: str) -> None:
         """Join the run. Gives back what an earlier process with the same file of records had not finished.
 
-        Args:
-            folder: of the run. records: the name of the file that this process holds and writes its records to.
+        folder: of the run. records: the name of the file that this process holds and writes its records to.
         """
         self.folder, self.records = folder, records
         self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}

@@ -5,10 +5,10 @@ from typing import ClassVar
 
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import PI05_VISIBILITY, Block, Visibility
 from mme_vla.backbone.base import Hook, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.backbone.layers import PI05_VISIBILITY, Block, Visibility
+from mme_vla.errors import check_choice
 from mme_vla.types import MemoryTokens
 
 MEMORY_VISIBILITY: Visibility = {
@@ -30,9 +30,7 @@ POSITIONS = ("slot", "time")
 
 def checked_position(memory_position: str) -> str:
     """The value of `integration.memory_position`."""
-    if memory_position not in POSITIONS:
-        known = did_you_mean(str(memory_position), POSITIONS)
-        raise UserError(f"integration.memory_position={brief(memory_position)}: choose slot or time. {known}")
+    check_choice("integration.memory_position", memory_position, POSITIONS)
     return memory_position
 
 
@@ -47,7 +45,7 @@ class Integration(nn.Module):
         hook: the action expert's per-layer hook for this chunk, with all that depends on memory alone computed now.
         condition: what becomes of the condition of the action expert's norms (the embedded flow time).
         beside: blocks that stand beside the actions in every step; `visibility` needs rows for them.
-        brings: doors it goes through by no method of this class, where only other kinds of policy have them.
+        required_features: what a backbone must support beside the methods overridden here (`Backbone.supports`).
         memory_position: `time` where its attention on memory counts frames, which needs a memory whose tokens tell
             their ages; `slot` where it counts tokens.
     """
@@ -84,10 +82,10 @@ class Integration(nn.Module):
 
 
 def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
-    """Where a memory block stands whose tokens are placed in time, [b, budget] float32; None numbers it by slots.
+    """Rotary positions of memory tokens by the age of their frames, [b, budget] float32; None numbers them by slots.
 
-    The current frame is the last place before the blocks that follow, and every frame before it is a place further
-    back: how far one token stands from another, or from what follows, does not depend on what else is remembered.
+    The current frame has the last position before the blocks that follow, and a frame t frames ago lies t positions
+    before it. So the distance between two tokens does not depend on the other tokens in memory.
     """
     if memory_position == "slot":
         return None
@@ -95,18 +93,18 @@ def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | N
 
 
 def ages_of(memory: MemoryTokens) -> Tensor:
-    """How many frames ago each memory token's moment was, or say that they do not tell."""
+    """How many frames ago each memory token's frame was, [b, budget]."""
     if memory.ages is None:
         raise ValueError("memory_position=time: these memory tokens tell no ages (HistoryTokens.step was not given).")
     return memory.ages
 
 
 EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
-"""Methods of an integration that go through one of a backbone's doors (`Backbone.hosts`)."""
+"""Method of an integration → the feature that a backbone must support for it (`Backbone.supports`)."""
 
 
 def extension_points(kind: type[Integration]) -> frozenset[str]:
-    """The doors an integration goes through: those it overrides. Asked before it is built to a backbone's sizes."""
+    """The features of a backbone that an integration uses, known before it is built to the backbone's sizes."""
     overridden = {
         point for name, point in EXTENSION_POINTS.items() if getattr(kind, name) is not getattr(Integration, name)
     }
@@ -114,7 +112,7 @@ def extension_points(kind: type[Integration]) -> frozenset[str]:
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:
-    """Return the memory, or say that it is missing."""
+    """The memory tokens, which must be there."""
     if memory is None:
         raise ValueError("This policy has a memory: batch.history must hold its selection (it is None).")
     return memory

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.attention import Block, Visibility
-from mme_vla.backbone.config import BackboneConfig
-from mme_vla.errors import UserError
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.layers import Block, Visibility
+from mme_vla.errors import require
 from mme_vla.integration.base import (
     MEMORY_VISIBILITY,
     Integration,
@@ -44,17 +44,17 @@ class Context(Integration):
                 states do.
         """
         super().__init__(backbone)
-        if not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False):
-            raise UserError(
-                "integration.prompt_sees_memory=false hides memory from the prompt, but in this backbone every token "
-                "sees every other: leave it true."
-            )
+        require(
+            not (not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False)),
+            "integration.prompt_sees_memory=false hides memory from the prompt, but in this backbone every token "
+            "sees every other: leave it true.",
+        )
         self.memory_width, self.memory_position = backbone.vlm.width, checked_position(memory_position)
-        if mutual and (memory_position == "time" or not prompt_sees_memory):
-            raise UserError(
-                "integration.mutual=true puts memory between images and prompt, where all see each other: that goes "
-                "with memory_position=slot and prompt_sees_memory=true alone."
-            )
+        require(
+            not (mutual and (memory_position == "time" or not prompt_sees_memory)),
+            "integration.mutual=true puts memory between images and prompt, where all see each other: that goes "
+            "with memory_position=slot and prompt_sees_memory=true alone.",
+        )
         self.mutual = mutual
         self.visibility = MUTUAL if mutual else memory_visibility(prompt_sees_memory)
 
@@ -64,3 +64,34 @@ class Context(Integration):
         block = Block("memory", memory.tokens, memory.mask, "vlm", positions)
         before = 1 + [block.name for block in observation].index("images") if self.mutual else 0
         return [*observation[:before], block, *observation[before:]]
+
+
+@INTEGRATIONS.register("expert")
+class MemoryExpert(Integration):
+    """[memory] in an expert of its own, then [images | prompt] in the VLM expert, then actions."""
+
+    def __init__(
+        self,
+        backbone: BackboneConfig,
+        width: int | None = None,
+        mlp_dim: int | None = None,
+        prompt_sees_memory: bool = True,
+        memory_position: str = "slot",
+    ) -> None:
+        """`width` defaults to the action expert's, `mlp_dim` to twice the width: 1024 and 2048 at full size.
+
+        The others are as `Context` has them.
+        """
+        super().__init__(backbone)
+        self.memory_width = width or backbone.action.width
+        self.memory_position = checked_position(memory_position)
+        self.visibility = memory_visibility(prompt_sees_memory)
+        self._expert = ExpertConfig(self.memory_width, mlp_dim or 2 * self.memory_width)
+
+    def extra_experts(self) -> dict[str, ExpertConfig]:
+        return {"memory": self._expert}
+
+    def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
+        memory = required(memory)
+        positions = explicit_positions(memory, self.memory_position)
+        return [Block("memory", memory.tokens, memory.mask, "memory", positions), *observation]

@@ -4,14 +4,14 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import check_whole
 from mme_vla.integration.base import Integration, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
 
 
 class PooledIntegration(Integration):
-    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one says it hosts `vector`."""
+    """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one supports `vector`."""
 
     required_features = frozenset({"vector"})
     feature_width: int
@@ -32,8 +32,7 @@ class FiLM(PooledIntegration):
             backbone: sizes, of no concern here. width: of the memory tokens and of the vector.
         """
         super().__init__(backbone)
-        if isinstance(width, bool) or not isinstance(width, int) or width < 1:
-            raise UserError(f"integration.width={brief(width)} must be a positive whole number.")
+        check_whole("integration.width", width)
         self.memory_width = self.feature_width = width
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, width)
 

@@ -5,10 +5,9 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import additive_mask, attend
 from mme_vla.backbone.base import Hook, LayerHooks
 from mme_vla.backbone.config import BackboneConfig
-from mme_vla.backbone.layers import EPS, RMSNorm, compute_dtype, rms_normalise, rotate, rotation
+from mme_vla.backbone.layers import EPS, RMSNorm, additive_mask, attend, compute_dtype, rms_normalise, rotate, rotation
 from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens

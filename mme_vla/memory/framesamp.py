@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
-from mme_vla.memory.base import all_patches, union_frames
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.errors import require
+from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -36,11 +35,11 @@ class FrameSamp(PerceptualMemory):
         Args:
             every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor encoded. 1: all.
         """
-        if budget % grid**2 or budget < grid**2:
-            raise UserError(
-                f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
-                f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}."
-            )
+        require(
+            budget % grid**2 == 0 and budget >= grid**2,
+            f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
+            f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}.",
+        )
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         self.frames = budget // grid**2
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, check_choice, check_sizes, require
 from mme_vla.types import FrameBatch
 
 
@@ -37,12 +37,9 @@ class StorageSpec:
     scorer: str = ""
 
     def __post_init__(self) -> None:
-        if self.grid < 1:
-            raise UserError(f"memory.grid={self.grid} must be at least 1: the side of a remembered frame's token grid.")
-        if self.pooling not in ("mean", "max"):
-            raise UserError(f"memory.pooling={self.pooling!r}: choose mean (as released) or max (as the paper writes).")
-        if self.keep_every < 1:
-            raise UserError(f"memory: keeping every {self.keep_every}th frame is not possible; it must be at least 1.")
+        check_sizes("memory", grid=self.grid)
+        check_choice("memory.pooling", self.pooling, ("mean", "max"))
+        require(self.keep_every >= 1, f"memory: keeping every {self.keep_every}th frame is not possible: at least 1.")
 
     def keeps(self, frame: int) -> bool:
         """Whether tokens of this frame are stored."""

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
     CompilableMemory,
     MemoryModule,
@@ -56,7 +56,9 @@ class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, 
         sections = shares(members, budget)
         built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
         self.members = nn.ModuleList(built)
-        self.names = _distinct([section["name"] for section in sections])
+        names = [section["name"] for section in sections]
+        # Equal names get a number.
+        self.names = [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]
         self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
@@ -222,12 +224,16 @@ def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
 
 def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict[str, Any]]:
     """Every member's section, with a budget: its own, or an even share of what the others leave."""
-    if isinstance(members, str | Mapping) or len(members) < 2:
-        raise UserError(f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].")
+    require(
+        not isinstance(members, str | Mapping) and len(members) >= 2,
+        f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].",
+    )
     sections: list[dict[str, Any]] = [dict(m) if isinstance(m, Mapping) else {"name": m} for m in members]
     for section in sections:
-        if not isinstance(section.get("name"), str) or section["name"] == "joined":
-            raise UserError(f"memory.members: {brief(section)} is no memory to join; give a name, or {{name: …}}.")
+        require(
+            isinstance(section.get("name"), str) and section["name"] != "joined",
+            f"memory.members: {brief(section)} is no memory to join; give a name, or {{name: …}}.",
+        )
     taken = sum(section.get("budget") or 0 for section in sections)
     open_ones = [section for section in sections if section.get("budget") is None]
     share = (budget - taken) // max(len(open_ones), 1)
@@ -244,11 +250,11 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
     """What has to be stored so that every one of these memories finds what it wants."""
     (first, one), *_ = specs.items()
     for name, other in specs.items():
-        if other.pooling != one.pooling:
-            raise UserError(
-                f"{first} stores {one} and {name} {other}: one history pools in one way. Set the same "
-                f"pooling for both, such as {{name: {name}, pooling: {one.pooling}}}."
-            )
+        require(
+            other.pooling == one.pooling,
+            f"{first} stores {one} and {name} {other}: one history pools in one way. Set the same "
+            f"pooling for both, such as {{name: {name}, pooling: {one.pooling}}}.",
+        )
     scorers = {name: spec.scorer for name, spec in specs.items() if spec.scorer}
     if len(set(scorers.values())) > 1:
         raise UserError(
@@ -263,8 +269,7 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
 def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
     """What the one member gives that looks back; None where none does."""
     defined = {name: spec for name, spec in specs.items() if spec is not None}
-    if len(defined) > 1:
-        raise UserError(f"{' and '.join(defined)} each give the vision tower past views: join only one of them.")
+    require(len(defined) <= 1, f"{' and '.join(defined)} each give the vision tower past views: join only one of them.")
     return next(iter(defined.values()), None)
 
 
@@ -275,8 +280,3 @@ def _padded(part: HistoryTokens, member: MemoryModule) -> HistoryTokens:
     pad = nn.functional.pad
     features, positions = pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends))
     return HistoryTokens(features, positions, pad(part.mask, ends), part.step)
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, with a number behind those that came before."""
-    return [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]

@@ -16,21 +16,59 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla.config.devices import float32_products
-from mme_vla.errors import UserError
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import (
     CompilableMemory,
+    FeatureEncoder,
     MatmulPrecision,
     MemoryModule,
     StreamingMemory,
     all_patches,
-    jittered,
-    recurrent_frames,
     token_positions,
     union_frames,
 )
-from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
+
+
+def recurrent_frames(
+    step: int, exec_start: int, max_steps: int = 64, max_video: int = 40, stride: int = 16
+) -> np.ndarray:
+    """Frames read at `step`, ascending and ending with `step`; at most `max_steps`, the earliest dropped first.
+
+    Execution frames stand `stride` apart, counted back from `step`, so the offset comes from `step` alone. Video
+    frames stand half a stride apart in a video of up to two strides, a stride apart while that gives no more than
+    `max_video`, and are spread evenly, both ends included, beyond that.
+
+    Args:
+        step: the current frame. exec_start: the first execution frame (0 without video). While the video still runs,
+            all frames before the current one count as video, so a finished episode and a running one agree.
+
+    Returns:
+        int64 [n].
+    """
+    start = min(exec_start, step)
+    execution = np.arange(start + (step - start) % stride, step + 1, stride)
+    return np.concatenate([video_frames(start, max_video, stride), execution])[-max_steps:]
+
+
+def video_frames(length: int, max_video: int, stride: int) -> np.ndarray:
+    """Frames read of a conditioning video of `length` frames."""
+    if length <= 2 * stride:
+        return np.arange(0, length, max(stride // 2, 1))
+    if length <= max_video * stride:
+        return np.arange(0, length, stride)
+    return np.linspace(0, length - 1, max_video).astype(np.int64)
+
+
+def jittered(frames: np.ndarray, exec_start: int, jitter: int, rng: np.random.Generator) -> np.ndarray:
+    """Move every frame but the last by up to `jitter` frames, video and execution each within its own part."""
+    past, step = frames[:-1], frames[-1]
+    shifted = past + rng.integers(-jitter, jitter + 1, len(past))
+    video = past < exec_start
+    low, high = np.where(video, 0, exec_start), np.where(video, min(exec_start, step) - 1, step - 1)
+    return np.append(np.unique(np.clip(shifted, low, high)), step)
+
 
 State = tuple[Tensor, ...]
 """What is carried from frame to frame; each tensor [b, …]."""
@@ -139,6 +177,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         budget: int,
         grid: int = 8,
         pooling: str = "mean",
+        *,
         max_steps: int = 64,
         max_video: int = 40,
         stride: int = 16,
@@ -161,14 +200,8 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
         """
         super().__init__()
-        sizes = {"max_steps": max_steps, "max_video": max_video, "stride": stride, "chunk": chunk}
-        for key, value in sizes.items():
-            if value < 1:
-                raise UserError(f"memory.{key}={value} must be at least 1.")
-        if not 0 <= 2 * jitter < stride:
-            raise UserError(
-                f"memory.jitter={jitter} must be less than half of memory.stride={stride}: frames keep order."
-            )
+        check_sizes("memory", max_steps=max_steps, max_video=max_video, stride=stride, chunk=chunk)
+        require(0 <= 2 * jitter < stride, f"memory.jitter={jitter} must be less than half of memory.stride={stride}.")
         self.budget, self.capacity = budget, max_steps * grid**2
         self.storage = StorageSpec(grid, pooling)
         self.max_steps, self.max_video, self.stride = max_steps, max_video, stride

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import check_choice, check_sizes, require
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
     RecurrentMemory,
@@ -48,15 +48,13 @@ class RMTLayer(RecurrentLayer):
         attention_dtype: str = "bfloat16",
     ) -> None:
         super().__init__()
-        if hidden % (2 * heads) or heads % kv_heads:
-            raise UserError(
-                f"memory.hidden={hidden}, memory.heads={heads}, memory.kv_heads={kv_heads} do not fit: hidden must be "
-                "an even multiple of heads, and heads a multiple of kv_heads."
-            )
-        if rotation not in ROTATIONS:
-            raise UserError(f"memory.rotation={rotation!r}: choose one of {', '.join(ROTATIONS)}.")
-        if attention_dtype not in ATTENTION_DTYPES:
-            raise UserError(f"memory.attention_dtype={attention_dtype!r}: choose one of {', '.join(ATTENTION_DTYPES)}.")
+        require(
+            hidden % (2 * heads) == 0 and heads % kv_heads == 0,
+            f"memory.hidden={hidden}, memory.heads={heads}, memory.kv_heads={kv_heads} do not fit: hidden must be "
+            "an even multiple of heads, and heads a multiple of kv_heads.",
+        )
+        check_choice("memory.rotation", rotation, ROTATIONS)
+        check_choice("memory.attention_dtype", attention_dtype, ATTENTION_DTYPES)
         self.head_dim, self.kv_heads = hidden // heads, kv_heads
         self.rotation, self.attention_dtype = rotation, ATTENTION_DTYPES[attention_dtype]
         self.q = nn.Linear(hidden, hidden, bias=False)
@@ -164,8 +162,7 @@ class RMT(RecurrentMemory):
             attention_dtype: what queries, keys and values are cast to; `bfloat16` as released; `float32` takes
                 the fused kernel, which keeps no weights: less memory.
         """
-        if budget < 1:
-            raise UserError(f"memory.budget={budget} must be at least 1.")
+        check_sizes("memory", budget=budget)
         hidden = default_hidden(d_vision, hidden)
         heads = heads or max(2, hidden // 64)
         layer = RMTLayer(hidden, heads, kv_heads, budget, rotation, attention_dtype)

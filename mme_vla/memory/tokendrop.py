@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
-from mme_vla.memory.base import ScoringMemory
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.errors import UserError, check_sizes, require
+from mme_vla.memory.base import PerceptualMemory, ScoringMemory
 from mme_vla.memory.history import FORMER_KEYS, FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -72,13 +71,12 @@ class TokenDrop(PerceptualMemory, ScoringMemory):
             causal: only frames up to the current one compete for that list. False lets the whole episode compete,
                 as the released offline preprocessing does; it needs a finished episode.
         """
-        if stride < 1:
-            raise UserError(f"memory.stride={stride} must be at least 1: the frames between two that are scored.")
-        if not grid**2 <= budget <= candidates:
-            raise UserError(
-                f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
-                f"memory.candidates={candidates} (the patches a running list holds)."
-            )
+        check_sizes("memory", stride=stride)
+        require(
+            grid**2 <= budget <= candidates,
+            f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
+            f"memory.candidates={candidates} (the patches a running list holds).",
+        )
         storage = StorageSpec(grid, pooling, keep_every=stride, scorer=ChangeScorer(grid, stride).key)
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.stride, self.candidates, self.causal = stride, candidates, causal

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
     RecurrentMemory,
@@ -56,10 +56,9 @@ class TTTLayer(RecurrentLayer):
         max_grad_norm: float,
     ) -> None:
         super().__init__()
-        if hidden % heads:
-            raise UserError(f"memory.hidden={hidden} must be a multiple of memory.heads={heads}.")
-        if base_rate <= 0 or max_rate <= 0 or max_grad_norm <= 0:
-            raise UserError("memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0.")
+        require(hidden % heads == 0, f"memory.hidden={hidden} must be a multiple of memory.heads={heads}.")
+        positive = min(base_rate, max_rate, max_grad_norm) > 0
+        require(positive, "memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0.")
         width = hidden // heads
         self.heads, self.budget, self.patches, self.window = heads, budget, patches, -(-budget // patches)
         self.base_rate, self.max_rate, self.max_grad_norm = base_rate, max_rate, max_grad_norm
@@ -197,11 +196,11 @@ class TTT(RecurrentMemory):
             base_rate: inner learning rate at the start. max_rate: its ceiling, per token and head.
             max_grad_norm: ceiling of an inner gradient's norm.
         """
-        if not 0 < budget <= max_steps * grid**2:
-            raise UserError(
-                f"memory.budget={budget} must lie between 1 and memory.max_steps × grid² = {max_steps * grid**2}: "
-                "TTT hands over one token for each it reads."
-            )
+        require(
+            0 < budget <= max_steps * grid**2,
+            f"memory.budget={budget} must lie between 1 and memory.max_steps × grid² = {max_steps * grid**2}: "
+            "TTT hands over one token for each it reads.",
+        )
         hidden = default_hidden(d_vision, hidden)
         layer = TTTLayer(hidden, heads, budget, grid**2, base_rate, max_rate, max_grad_norm)
         super().__init__(d_vision, width, layer, hidden, budget, grid, max_steps=max_steps, **options)

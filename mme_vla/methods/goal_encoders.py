@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.processing.base import PolicyProcessor, read_settings
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import checked_text
@@ -52,8 +52,7 @@ def load_with_goal_encoder[P: PolicyProcessor](
             taken on a checkpoint's word.
     """
     settings = read_settings(folder)
-    if settings.pop("name", None) != name:
-        raise UserError(f"{folder} holds a processor of another kind of policy.")
+    require(settings.pop("name", None) == name, f"{folder} holds a processor of another kind of policy.")
     text, stats = settings.get("text"), settings.pop("stats", None)
     if encoder is not None:
         settings["text"] = str(encoder)
@@ -65,8 +64,7 @@ def load_with_goal_encoder[P: PolicyProcessor](
     try:
         options: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
         if stats is not None:
-            if not isinstance(stats, str):
-                raise UserError(f"stats={brief(stats)} must be the name of a file.")
+            require(isinstance(stats, str), f"stats={brief(stats)} must be the name of a file.")
             path = inside(folder, stats, "statistics")
             check_sums(folder, [stats])
             options["stats"] = NormStats.load(path)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mme_vla.backbone.layers import rotation
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
-from mme_vla.speed.recompute import Recompute, checkpoint_options
+from mme_vla.speed import Recompute, checkpoint_options
 
 
 @dataclass(frozen=True)

@@ -27,46 +27,6 @@ if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
 
-class Snapshots:
-    """Snapshots of one task's scene, in the order they were taken; velocities are not part of them.
-
-    A snapshot is read from the simulator's own objects: that takes a tenth of what `get_state_dict` takes, and brings
-    back marks and traces, which belong to no thing of the task.
-    """
-
-    def __init__(self, task: "Task") -> None:
-        from sapien.render import RenderBodyComponent
-
-        entities = [actor._objs[0] for actor in task.scene.actors.values() if actor.px_body_type != "static"]
-        self._entities = entities
-        bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in entities]
-        self._bodies = [body for body in bodies if body is not None]
-        self._articulations = [each._objs[0] for each in task.scene.articulations.values()]
-        self._taken: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
-
-    def __len__(self) -> int:
-        return len(self._taken)
-
-    def take(self) -> None:
-        """Keep the scene as it stands."""
-        self._taken.append((
-            [entity.pose for entity in self._entities],
-            [body.visibility for body in self._bodies],
-            [(each.root_pose, each.qpos) for each in self._articulations],
-        ))  # fmt: skip
-
-    def put_back(self, number: int) -> None:
-        """Make the scene stand as in a snapshot, counted from 0."""
-        poses, visibilities, joints = self._taken[number]
-        for entity, pose in zip(self._entities, poses, strict=True):
-            entity.pose = pose
-        for body, visibility in zip(self._bodies, visibilities, strict=True):
-            body.visibility = visibility
-        for each, (root, qpos) in zip(self._articulations, joints, strict=True):
-            each.root_pose = root
-            each.qpos = qpos
-
-
 SUBGOALS = ("simple", "grounded")
 
 
@@ -226,27 +186,50 @@ def record(
         env.close()
 
 
-@dataclass
 class _Taken:
-    """What is noted of every frame of an episode; `video` of them come before its execution."""
+    """What is noted of every frame of an episode; `video` of them come before its execution.
 
-    env: "Task"
-    states: list[np.ndarray] = field(default_factory=list)
-    scenes: Snapshots | None = None
-    texts: list[Mapping[str, Any]] = field(default_factory=list)
-    video: int = 0
+    A snapshot of the scene is read from the simulator's own objects, without velocities: that takes a tenth of what
+    `get_state_dict` takes, and brings back marks and traces, which belong to no thing of the task.
+    """
+
+    def __init__(self, env: "Task") -> None:
+        self.env, self.video = env, 0
+        self.states: list[np.ndarray] = []
+        self.texts: list[Mapping[str, Any]] = []
+        self._snapshots: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
 
     def add(self, observed: Mapping[str, Any], info: Mapping[str, Any], in_video: bool) -> None:
+        if not self._snapshots:
+            self._find_objects()  # of the scene as its episode begins
         self.texts.append(info)
         self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
-        self.scenes = self.scenes or Snapshots(self.env)  # of the scene as its episode begins
-        self.scenes.take()
         self.video += in_video
+        self._snapshots.append((
+            [entity.pose for entity in self._entities],
+            [body.visibility for body in self._bodies],
+            [(each.root_pose, each.qpos) for each in self._articulations],
+        ))  # fmt: skip
+
+    def _find_objects(self) -> None:
+        from sapien.render import RenderBodyComponent
+
+        scene = self.env.scene
+        self._entities = [actor._objs[0] for actor in scene.actors.values() if actor.px_body_type != "static"]
+        bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in self._entities]
+        self._bodies = [body for body in bodies if body is not None]
+        self._articulations = [each._objs[0] for each in scene.articulations.values()]
 
     def put_back(self, frame: int) -> None:
         """Make the scene stand as it did in a frame."""
-        assert self.scenes is not None
-        self.scenes.put_back(frame)
+        poses, visibilities, joints = self._snapshots[frame]
+        for entity, pose in zip(self._entities, poses, strict=True):
+            entity.pose = pose
+        for body, visibility in zip(self._bodies, visibilities, strict=True):
+            body.visibility = visibility
+        for each, (root, qpos) in zip(self._articulations, joints, strict=True):
+            each.root_pose = root
+            each.qpos = qpos
 
 
 def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:

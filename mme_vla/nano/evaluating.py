@@ -1,7 +1,7 @@
 """Closed-loop evaluation of a nano policy on the benchmark's episodes, through planned motions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +9,9 @@ from mme_vla.data.waypoints import Motions
 from mme_vla.envs.make import make_env, make_task
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import VIDEOS, choose_episodes, choose_shard, evaluate, memory_budget
-from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.evaluation import VIDEOS, choose_episodes, choose_shard, evaluate, facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.policy.saving import composition_digest
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import build_predictor
 
@@ -89,8 +87,7 @@ def run_episodes(
 
     A policy that reads subgoals gets the simulator's.
 
-    Args:
-        split, episodes, shard: as `evaluate` has them.
+    split, episodes, shard: as `evaluate` has them.
     """
     policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
     kind = subgoal_kind(policy)
@@ -98,11 +95,10 @@ def run_episodes(
     jobs = choose_episodes(task, episodes, split)
     records: list[EpisodeRecord] = []
     for seed in seeds:
-        settings = RolloutSettings(seed=seed, split=split, max_steps=max_steps, workers=workers, video=video)
-        facts = RunFacts(
-            str(policy.config["name"]), checkpoint.name, seed, split, max_steps, None if subgoals is None else ORACLE,
-            memory_budget=memory_budget(policy), composition=composition_digest(policy.config),
-        )  # fmt: skip
+        options = {"seed": seed, "split": split, "max_steps": max_steps, "workers": workers, "video": video}
+        settings = RolloutSettings.from_config(options)
+        facts = facts_of(policy, None, str(checkpoint), settings, None if subgoals is None else ORACLE)
+        facts = replace(facts, checkpoint=checkpoint.name)
         done = evaluate(
             policy, jobs, folder / f"seed{seed}", facts, settings, subgoals=subgoals, shard=choose_shard(shard),
             source=str(checkpoint),
@@ -114,8 +110,7 @@ def run_episodes(
 def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord]) -> list[Path]:
     """Videos of the first success and the first failure of these records, run once more with every frame rendered.
 
-    Args:
-        folder: of the videos; what it has is not rendered again.
+    folder: of the videos; what it has is not rendered again.
     """
     for won in (True, False):
         record = next((record for record in records if record.success is won), None)

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.composition import compose, import_plugins, plain
 from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import Demonstration
@@ -27,8 +27,7 @@ from mme_vla.training.settings import TrainSettings
 from mme_vla.utils import read_lines, write_json
 
 DONE = "trained.json"
-HELD_OUT = 10
-"""One demonstration in so many only measures the loss."""
+HELD_OUT = 10  # One demonstration in so many only measures the loss
 
 
 def compose_policy(
@@ -40,10 +39,9 @@ def compose_policy(
 ) -> dict[str, Any]:
     """Compose one model at nano size, as plain values, and import its plugins.
 
-    Args:
-        model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
-        words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
-        extra_dirs: further trees, as `--config-dir` adds them. plugins: modules that the model needs beside its own.
+    model: a file of configs/model. memories: settings of each memory by its name, used where the model has it. words:
+    overrides that all models share, such as `embodiment=robomme_waypoint_front`. extra_dirs: further trees, as
+    `--config-dir` adds them. plugins: modules that the model needs beside its own.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
     memory = None if base.memory is None else str(base.memory.name)
@@ -51,9 +49,7 @@ def compose_policy(
     composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
     import_plugins(composed)
-    config = OmegaConf.to_container(composed, resolve=True)
-    assert isinstance(config, dict)
-    return {str(key): value for key, value in config.items()}
+    return plain(composed)
 
 
 def build(config: Mapping[str, Any]) -> MMEPolicy:
@@ -74,9 +70,8 @@ def train(
 ) -> Path:
     """Train a policy in `folder`, or continue with it; the last checkpoint.
 
-    Args:
-        config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`.
-        files: demonstrations; one in `HELD_OUT` only measures the loss.
+    config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`. files:
+    demonstrations; one in `HELD_OUT` only measures the loss.
     """
     from accelerate import Accelerator
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
@@ -27,8 +27,7 @@ NARROWEST = 0.1  # of an action's number, in metres or radians: less than that i
 
 _PAST = "history."
 JOINT_NOISE = 0.05
-MIN_DISTANCE = 0.05
-"""Metres above the table from where on a motion is one to another place."""
+MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
 
 
 class SparseHistory(History):
@@ -92,17 +91,15 @@ class Decisions(Dataset[int]):
     ) -> "Decisions":
         """Make all tokens, of one demonstration after the other: their images together are gigabytes.
 
-        Args:
-            policy: with the vision weights it trains with, and statistics.
-            min_distance: metres from which on a motion leads to another place. The others: see the class.
+        policy: with the vision weights it trains with, and statistics. min_distance: metres from which on a motion
+        leads to another place. The others: see the class.
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
         for demonstration in demonstrations:
             items += _items(policy, demonstration)
             distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
-        if not items:
-            raise UserError("The demonstrations hold no decision to learn from.")
+        require(items, "The demonstrations hold no decision to learn from.")
         return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise)
 
     @classmethod

@@ -30,10 +30,9 @@ def write_page(
 ) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
-    Args:
-        records: of each model, the one with memory first, and of the oracle planner. without: the one without memory,
-            which all others are compared with. minutes: of each stage, on the clock and of processors. videos: one of a
-            success, one of a failure, as far as there are such.
+    records: of each model, the one with memory first, and of the oracle planner. without: the one without memory, which
+    all others are compared with. minutes: of each stage, on the clock and of processors. videos: one of a success, one
+    of a failure, as far as there are such.
     """
     trained = [model for model in records if model != PLANNER]
     results, comparisons = compared(records, config["task"], config["split"], without)
@@ -84,8 +83,7 @@ def _method(results: Results, record: EpisodeRecord) -> Method:
 def success_table(records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[str, Mapping[str, Any]]) -> str:
     """Success of each model, in all and by difficulty: won / run, and Wilson's interval of the distinct episodes.
 
-    Args:
-        ends: of each trained model, what `train` wrote: how far off its held-out decisions to go elsewhere were.
+    ends: of each trained model, what `train` wrote: how far off its held-out decisions to go elsewhere were.
     """
     columns = ("memory tokens", "all", "95 % interval", *LEVELS, "off by, held out", "within 2 cm")
     lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]

@@ -19,7 +19,7 @@ from torch.nn import functional
 from mme_vla.backbone.nano import NanoBackbone, NanoConfig
 from mme_vla.backbone.nano_vision import CLASSES, COARSE, FINE, WORDS, ConvTower
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.nano.scenes import LABEL_SIDE
 from mme_vla.processing.images import to_unit_range
 from mme_vla.processing.tokenizer import SAMPLE, Tokenizer
@@ -62,8 +62,7 @@ def _joined(x: Tensor, grid: int, side: int) -> Tensor:
 def fresh_tower(sizes: Mapping[str, Any], width: int) -> tuple[ConvTower, int]:
     """A tower with random weights, and the side of its token grid.
 
-    Args:
-        sizes: the section `backbone.vision`. width: of a token.
+    sizes: the section `backbone.vision`. width: of a token.
     """
     section = {"vision": {**sizes, "pretrained": False}, "vlm": {"width": width, "mlp_dim": width}}
     backbone = NanoBackbone(read_section(NanoConfig, section, "backbone"))
@@ -82,8 +81,7 @@ def class_words() -> Tensor:
 
 def load_scenes(files: Sequence[Path]) -> tuple[Tensor, Tensor]:
     """Images [n, 3, s, s] uint8 and labels [n, 64, 64] uint8 of recorded scenes."""
-    if not files:
-        raise UserError("There is no recorded scene to learn from.")
+    require(files, "There is no recorded scene to learn from.")
     images, labels = [], []
     for file in files:
         with np.load(file) as scene:
@@ -117,8 +115,7 @@ def tower_loss(tower: ConvTower, grid: int, images: Tensor, labels: Tensor, weig
 def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, settings: PretrainSettings) -> Path:
     """Train a tower on recorded scenes; a run that was interrupted continues. The path of its weights.
 
-    Args:
-        tower: with fresh weights. grid: side of its token grid. files: scenes. folder: of the run.
+    tower: with fresh weights. grid: side of its token grid. files: scenes. folder: of the run.
     """
     from safetensors.torch import save_file
 

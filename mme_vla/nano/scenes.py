@@ -23,8 +23,7 @@ _BY_NAME = {
     "container": "container", "button": "button", "target": "target", "spot": "target", "disc": "disc",
     "board": "box", "box": "box", "obstacle": "obstacle", "peg": "peg",
 }  # fmt: skip
-LABEL_SIDE = 64
-"""Labels have a number for each of 64×64 places of an image."""
+LABEL_SIDE = 64  # Labels have a number for each of 64×64 places of an image
 _CUBES = ("red cube", "green cube", "blue cube")
 _CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out where it has one
 
@@ -32,9 +31,7 @@ _CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out wher
 def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Images of one scene, differently arranged each time.
 
-    Args:
-        count: arrangements; each gives an image of the front camera and one of the wrist's.
-        size: side of the images.
+    count: arrangements; each gives an image of the front camera and one of the wrist's. size: side of the images.
 
     Returns:
         images [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.

@@ -17,12 +17,15 @@ __all__ = [
     "OraclePlayer", "Player", "QwenPlayer", "RandomPlayer", "Reveal", "build_player",
 ]  # fmt: skip
 
-_PLAYERS = ("PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player")
 _HOMES = {
-    "Option": "mme_vla.embodiment.action_space",
-    **dict.fromkeys(("ChoiceSession", "Decision", "EpisodeId", "Reveal"), "mme_vla.play.game"),
-    **dict.fromkeys(("GeminiPlayer", "OpenAIPlayer", "QwenPlayer"), "mme_vla.play.vlm_players"),
-    **dict.fromkeys(_PLAYERS, "mme_vla.play.players"),
+    name: f"mme_vla.{module}"
+    for module, names in {
+        "embodiment.action_space": ["Option"],
+        "play.game": ["ChoiceSession", "Decision", "EpisodeId", "Reveal"],
+        "play.players": ["PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player"],
+        "play.vlm_players": ["GeminiPlayer", "OpenAIPlayer", "QwenPlayer"],
+    }.items()
+    for name in names
 }
 
 

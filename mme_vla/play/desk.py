@@ -28,8 +28,7 @@ class Desk:
 
     Everything that touches the simulator runs in one thread, which also made it. The other methods return at once.
 
-    Args:
-        run: whose episodes are played. participant: kept with each record.
+    run: whose episodes are played. participant: kept with each record.
 
     Attributes:
         phase: `loading` (an episode is being set up), `choosing`, `moving`, `ended` (of one episode), `finished` (of
@@ -59,9 +58,8 @@ class Desk:
     def choose(self, request: Mapping[str, Any]) -> None:
         """Carry a choice out.
 
-        Args:
-            request: `choice` and `point`, with `session` and `decision` (how many were made before), so that a choice
-                sent twice, or from a page left open, does nothing.
+        request: `choice` and `point`, with `session` and `decision` (how many were made before), so that a choice sent
+        twice, or from a page left open, does nothing.
 
         Raises:
             StaleError: the question is no longer asked. UserError: the choice cannot be made; nothing has happened.

@@ -14,12 +14,11 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
 ONGOING = "ongoing"
-UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)
-"""Frame of an environment that does not render."""
+UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)  # Frame of an environment that does not render
 MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
 
 
@@ -91,8 +90,6 @@ class ChoiceSession:
         images: bool = True,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        if isinstance(max_choices, bool) or not isinstance(max_choices, int) or max_choices < 1:
-            raise UserError(f"max_choices is {max_choices!r}; expected a positive integer.")
         self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
         self.goal, self.status, self.error = "", "not started", ""
         self.ended_by = ""
@@ -108,16 +105,18 @@ class ChoiceSession:
 
     def start(self) -> Reveal:
         """Reset the environment, which shows the conditioning video, if any, and then the present frame."""
-        if self.reveals:
-            raise UserError("This session has begun; make a new one for another episode.")
+        require(not self.reveals, "This session has begun; make a new one for another episode.")
         started = self._clock()
         observation, info = self.env.reset()
         self._simulated += self._clock() - started
         frames = self._frames(observation)
-        if not frames:
-            raise UserError("The environment shows no images: make it with render=True.")
-        if "available_multi_choices" not in info:
-            raise UserError('The environment offers no options: make it with action_space="multi_choice".')
+        if not frames or "available_multi_choices" not in info:
+            way = (
+                'offers no options: make it with action_space="multi_choice"'
+                if frames
+                else "shows no images: make it with render=True"
+            )
+            raise UserError(f"The environment {way}.")
         title = "Conditioning video" if len(frames) > 1 else "The scene"
         self._take(frames, info, title)
         return self.reveals[0]
@@ -125,9 +124,8 @@ class ChoiceSession:
     def choose(self, action: Mapping[str, Any], note: Mapping[str, Any] | None = None) -> Reveal:
         """Carry out an option.
 
-        Args:
-            action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs one.
-            note: what to keep with the decision.
+        action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs one. note: what to
+        keep with the decision.
 
         Returns:
             The frames of the motion; none where nothing moved, or the environment could not do it.
@@ -152,28 +150,26 @@ class ChoiceSession:
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
         """The option and point that an action means."""
-        if self.status != ONGOING:
-            raise UserError(f"No choice can be made: the episode is over ({self.status})." if self.reveals
-                            else "No choice can be made before start().")  # fmt: skip
-        if not isinstance(action, Mapping) or not isinstance(action.get("choice"), str):
-            raise UserError(f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.')
-        label = action["choice"].strip().lower()
         options = {option.label: option for option in self.options}
-        if label not in options:
-            raise UserError(f"There is no option {action['choice']!r}. {did_you_mean(label, options)}")
+        choice = action.get("choice") if isinstance(action, Mapping) else None
+        label = choice.strip().lower() if isinstance(choice, str) else None
+        problem = ""
+        if self.status != ONGOING:
+            when = f": the episode is over ({self.status})" if self.reveals else " before start()"
+            problem = f"No choice can be made{when}."
+        elif label is None:
+            problem = f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.'
+        elif label not in options:
+            problem = f"There is no option {choice!r}. {did_you_mean(label, options)}"
+        if problem or label is None:
+            raise UserError(problem)
         option = options[label]
         return option, checked_point(action.get("point"), option) if option.needs_point else None
 
     def give_up(self, outcome: str, reason: str) -> None:
-        """End the episode without the environment.
-
-        Args:
-            outcome: what it counts as. reason: why, kept in the record.
-        """
-        if outcome not in OUTCOMES:
-            raise UserError(f"Unknown outcome {outcome!r}. {did_you_mean(outcome, OUTCOMES)}")
-        if self.over:
-            raise UserError(f"The episode is over already ({self.status}).")
+        """End the episode without the environment. outcome: what it counts as. reason: why, kept in the record."""
+        if outcome not in OUTCOMES or self.over:
+            raise ValueError(f"An episode that is {self.status} cannot end with {outcome!r}.")
         self.status, self.ended_by = outcome, reason
         if outcome == "error":
             self.error = reason
@@ -193,8 +189,6 @@ class ChoiceSession:
     @property
     def frame(self) -> np.ndarray:
         """The present front image [256, 256, 3]: points are pixels of it."""
-        if not self.reveals:
-            raise UserError("There is no image before start().")
         return next(reveal.frames[-1] for reveal in reversed(self.reveals) if len(reveal.frames))
 
     @property
@@ -206,8 +200,7 @@ class ChoiceSession:
         self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
     ) -> EpisodeRecord:
         """The episode as evaluation keeps it, its decisions in `extra`."""
-        if not self.over:
-            raise UserError(f"The episode is not over ({self.status}); there is nothing to record yet.")
+        require(self.over, f"The episode is not over ({self.status}); there is nothing to record yet.")
         which = self.episode
         ended = {"ended_by": self.ended_by} if self.ended_by else {}
         return EpisodeRecord(
@@ -244,17 +237,16 @@ class ChoiceSession:
 def checked_point(point: Any, option: Option) -> tuple[float, float]:
     """A pixel (row, column) of the front image."""
     what = f"Option {option.label!r} ({option.action})"
-    if point is None or (isinstance(point, Sequence) and not len(point)):
-        raise UserError(f"{what} needs a point: the pixel [row, column] of the object meant.")
     try:
-        values = np.asarray(point, np.float64)
+        values = np.asarray([] if point is None else point, np.float64)
     except (TypeError, ValueError):
-        values = np.empty(0)
-    if values.shape != (2,) or not np.isfinite(values).all():
-        raise UserError(f"{what} needs two numbers as its point, a pixel's row and column; got {point!r}.")
-    y, x = (float(value) for value in values)
-    if not (0 <= y < SIDE and 0 <= x < SIDE):
-        raise UserError(
-            f"The point ({y:g}, {x:g}) lies outside of the image: rows and columns go from 0 to {SIDE - 1}."
-        )
-    return y, x
+        values = np.empty(1)
+    problem = ""
+    if not values.size:
+        problem = "needs a point: the pixel [row, column] of the object meant"
+    elif values.shape != (2,) or not np.isfinite(values).all():
+        problem = f"needs two numbers as its point, a pixel's row and column; got {point!r}"
+    elif not ((values >= 0) & (values < SIDE)).all():
+        problem = f"needs a point of the image, and {point} lies outside of the image: 0 to {SIDE - 1}"
+    require(not problem, f"{what} {problem}.")
+    return float(values[0]), float(values[1])

@@ -66,11 +66,7 @@ def play(session: ChoiceSession, player: Player) -> ChoiceSession:
 
 @PLAYERS.register("random")
 class RandomPlayer(Player):
-    """Any option, any pixel: the floor.
-
-    Args:
-        seed: with the episode, decides what is chosen.
-    """
+    """Any option, any pixel: the floor. seed: with the episode, decides what is chosen."""
 
     model = "random"
     needs_images = False

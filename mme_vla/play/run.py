@@ -17,9 +17,8 @@ from mme_vla.play.game import ChoiceSession, EpisodeId
 def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int, images: bool = True) -> ChoiceSession:
     """The simulator for one episode.
 
-    Args:
-        episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out.
-        images: whether the player reads them; the official environment renders in any case.
+    episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out. images: whether the
+    player reads them; the official environment renders in any case.
     """
     from mme_vla.envs import make_env
 
@@ -86,10 +85,8 @@ class PlayRun:
     ) -> EpisodeRecord:
         """Write that an episode could not be played to its end.
 
-        Args:
-            which: the episode. reason: what broke.
-            session: as far as it came; None where it could not even be made.
-            extra: more to keep with the record.
+        which: the episode. reason: what broke. session: as far as it came; None where it could not even be made. extra:
+        more to keep with the record.
         """
         if session is not None:
             if not session.over:

@@ -50,10 +50,8 @@ def choice_text(decision: Decision) -> str:
 def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = "") -> str:
     """One question that tells the whole episode, `<video>` and `<image>` where images go.
 
-    Args:
-        goal: the task in words.
-        clips: what each clip that was shown is, in order, and whether it has frames.
-        complaint: why the last reply to the same question could not be used; empty the first time.
+    goal: the task in words. clips: what each clip that was shown is, in order, and whether it has frames. complaint:
+    why the last reply to the same question could not be used; empty the first time.
     """
     lines = [f"The task: {goal}"]
     lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
@@ -97,50 +95,45 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
     Raises:
         MalformedReply: no object, an unknown option, or a point that is missing or none.
     """
-    if not reply.strip():
-        raise MalformedReply("the answer is empty")
-    fields = _last_object(reply)
+    fields = next(filter(None, map(_parsed, reversed(_OBJECT.findall(reply)))), {})
     letter = fields.get("choice")
-    if not isinstance(letter, str):
-        raise MalformedReply('the answer has no "choice"')
-    label = letter.strip().strip("().:[]").lower()
+    label = letter.strip().strip("().:[]").lower() if isinstance(letter, str) else None
     option = next((option for option in options if option.label == label), None)
-    if option is None:
-        raise MalformedReply(
-            f"there is no option {brief(letter)}; the options are {', '.join(o.label for o in options)}"
-        )
-    return {"choice": label, "point": _pixel(fields.get("point"), option) if option.needs_point else None}
+    problem = None
+    if not fields:
+        problem = "the answer holds no JSON object" if reply.strip() else "the answer is empty"
+    elif label is None:
+        problem = 'the answer has no "choice"'
+    elif option is None:
+        problem = f"there is no option {brief(letter)}; the options are {', '.join(o.label for o in options)}"
+    elif option.needs_point:
+        problem = _misfit(fields.get("point"), option)
+    if problem is not None or option is None:
+        raise MalformedReply(problem)
+    point = [min(to_pixels(value, SIDE), SIDE - 1) for value in fields["point"]] if option.needs_point else None
+    return {"choice": label, "point": point}
 
 
-def _pixel(point: Any, option: Option) -> list[int]:
+def _misfit(point: Any, option: Option) -> str | None:
     if not isinstance(point, list) or len(point) != 2:
-        raise MalformedReply(f'option {option.label} needs "point": [row, column]')
-    for value in point:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise MalformedReply("a point is made of two numbers")
-        if isinstance(value, float) and not math.isfinite(value):  # of a whole number too long, isfinite raises
-            raise MalformedReply("a point is made of two numbers")
-        if not 0 <= value <= THOUSAND:
-            raise MalformedReply(f"a point lies within 0 and {THOUSAND}")
-    return [min(to_pixels(value, SIDE), SIDE - 1) for value in point]
+        return f'option {option.label} needs "point": [row, column]'
+    if any(isinstance(v, bool) or not isinstance(v, int | float) or v != v or abs(v) == math.inf for v in point):
+        return "a point is made of two numbers"
+    return None if all(0 <= value <= THOUSAND for value in point) else f"a point lies within 0 and {THOUSAND}"
 
 
-def _last_object(reply: str) -> dict[str, Any]:
-    for text in reversed(_OBJECT.findall(reply)):
-        try:
-            fields: dict[str, Any] = parse_json(text, "the answer", finite=False)
-            return fields
-        except UserError:
-            continue
-    raise MalformedReply("the answer holds no JSON object")
+def _parsed(text: str) -> dict[str, Any]:
+    try:
+        fields: dict[str, Any] = parse_json(text, "the answer", finite=False)
+    except UserError:
+        return {}
+    return fields
 
 
 class ModelPlayer(Player):
     """A model that makes each choice, with retries where its reply cannot be used.
 
-    Args:
-        model: its name.
-        tries: replies that may be unusable in a row; then the episode counts as failed.
+    model: its name. tries: replies that may be unusable in a row; then the episode counts as failed.
     """
 
     def __init__(self, model: str, tries: int = 3) -> None:
@@ -173,8 +166,7 @@ class ModelPlayer(Player):
     def ask(self, session: ChoiceSession, complaint: str) -> str:
         """The model's reply to the present question, verbatim.
 
-        Args:
-            complaint: why its last reply to the same question could not be used; empty the first time.
+        complaint: why its last reply to the same question could not be used; empty the first time.
 
         Raises:
             NoChoiceError: the model sent no reply.
@@ -252,10 +244,8 @@ class QwenPlayer(ModelPlayer):
 class GeminiPlayer(ModelPlayer):
     """One conversation an episode: each turn brings the frames since the last decision.
 
-    Args:
-        tries: replies that may be unusable in a row.
-        client: an object with google-genai's `client.models.generate_content`; None makes one.
-        settings: keys of `mme_vla.subgoal.models.connection.Settings`.
+    tries: replies that may be unusable in a row. client: an object with google-genai's
+    `client.models.generate_content`; None makes one. settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
 
     provider = "gemini"

@@ -8,7 +8,7 @@ from importlib.resources import files
 from importlib.util import find_spec
 from typing import Any
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.play.desk import Desk, StaleError
 from mme_vla.serving.settings import is_local, listen
 from mme_vla.utils import parse_json
@@ -36,9 +36,8 @@ def require_page() -> None:
 def make_app(desk: Desk, local: bool = True) -> Any:
     """The ASGI application; the desk begins when it starts.
 
-    Args:
-        local: accept only requests that name this machine as their host, so that no foreign page a browser has open can
-            reach the desk under a name of its own.
+    local: accept only requests that name this machine as their host, so that no foreign page a browser has open can
+    reach the desk under a name of its own.
     """
     require_page()
     from starlette.applications import Starlette
@@ -76,8 +75,7 @@ def make_app(desk: Desk, local: bool = True) -> Any:
             async with asyncio.timeout(ARRIVAL_S):
                 async for piece in request.stream():
                     content += piece
-                    if len(content) > MOST:
-                        raise UserError(f"The request is longer than {MOST} bytes.")
+                    require(len(content) <= MOST, f"The request is longer than {MOST} bytes.")
         except TimeoutError:
             raise UserError(f"The request did not arrive within {ARRIVAL_S} s.") from None
         return parse_json(bytes(content) or b"{}", "The request")

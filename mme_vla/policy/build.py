@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.backbone.config import shapes_only
+from mme_vla.backbone.building import shapes_only
 from mme_vla.config.naming import words
 from mme_vla.config.plugins import import_plugins, plugins_of
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import Memory, check_grid, past_view_spec
 from mme_vla.policy.base import Policy
@@ -157,11 +157,11 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
     subgoal = sections["processor"].get("subgoal_length") if reads else 0
     if subgoal is None:
         raise UserError(f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length.")
-    if memory + subgoal > budget:
-        raise UserError(
-            f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal} tokens, more than "
-            f"token_budget={budget}: lower one of them, or raise token_budget."
-        )
+    require(
+        memory + subgoal <= budget,
+        f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal} tokens, more than "
+        f"token_budget={budget}: lower one of them, or raise token_budget.",
+    )
 
 
 def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:

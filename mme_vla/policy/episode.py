@@ -1,6 +1,7 @@
 """One running episode: all streaming state is here, never on the policy."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -8,20 +9,28 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import past_view_spec, start_history, start_stream, uses_proprio
 from mme_vla.memory.history import History, OnlineHistory
-from mme_vla.policy.action_prefix import ActionPrefix, checked_prefix
 from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
 from mme_vla.processing.normalise import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
-from mme_vla.types import FrameBatch, HistoryTokens, PastViews
+from mme_vla.speed.rtc import overlap_weights
+from mme_vla.types import FrameBatch, HistoryTokens, Overlap, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import MemoryModule
     from mme_vla.processing.base import PolicyProcessor
+
+
+@dataclass(frozen=True)
+class ActionPrefix:
+    """Actions [n, w] float32 as the robot takes them, of which the first `delay` are executed before the next chunk."""
+
+    actions: np.ndarray
+    delay: int
 
 
 class Host(Protocol):
@@ -149,8 +158,7 @@ class Episode:
         camera = self._robot.memory_camera
         frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
-        if demo.shape not in ((), (len(frames),)):
-            raise UserError(f"is_demo must be one flag or {len(frames)}, one a frame; got {demo.shape}.")
+        require(demo.shape in ((), (len(frames),)), f"is_demo must be one flag or {len(frames)}; got {demo.shape}.")
         if states is not None and np.shape(states) != (len(frames), self._robot.state.width):
             raise UserError(f"states must be [{len(frames)}, {self._robot.state.width}]; got {list(np.shape(states))}.")
         if len(frames):
@@ -169,8 +177,9 @@ class Episode:
         self._require_single_view()
         state = finite_array(state, "the state")
         width, names = self._robot.state.width, self._robot.camera_names
-        if state.shape != (width,):
-            raise UserError(f"set_view() needs a state of {width} finite numbers, got shape {state.shape}.")
+        require(
+            state.shape == (width,), f"set_view() needs a state of {width} finite numbers, got shape {state.shape}."
+        )
         if lacking := [name for name in names if name not in views]:
             raise UserError(f"set_view() needs an image of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
         processor = self._policy.require_processor()
@@ -285,19 +294,21 @@ class Episode:
         return np.zeros((0, self._robot.action.width), np.float32)
 
     def _require_single_view(self) -> None:
-        if self._past is not None:
-            raise UserError(
-                "This policy's vision tower reads past images of every camera: use `Episode.observe`, not past frames "
-                "of one camera and the current view apart."
-            )
+        require(
+            self._past is None,
+            "This policy's vision tower reads past images of every camera: use `Episode.observe`, not past frames "
+            "of one camera and the current view apart.",
+        )
 
     def _checked_course(
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flags [count] of the next frames and the actions that led to the execution frames among them."""
         demo = np.broadcast_to(demo, (count,))
-        if demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any()):
-            raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
+        require(
+            not (demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any())),
+            "A conditioning-video frame came after the first execution frame; the video goes first.",
+        )
         return demo, self._executed_now(int((~demo).sum()), actions)
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
@@ -309,10 +320,10 @@ class Episode:
         if space.frames is None and values.ndim:
             count = len(values)
         executed = values[max(len(values) - count, 0) :] if values.ndim else values
-        if executed.shape != (count, space.width):
-            raise UserError(
-                f"actions must be [{count}, {space.width}], one for each execution frame; got {executed.shape}."
-            )
+        require(
+            executed.shape == (count, space.width),
+            f"actions must be [{count}, {space.width}], one for each execution frame; got {executed.shape}.",
+        )
         return executed
 
     def _take(
@@ -361,13 +372,46 @@ class Episode:
         return images
 
     def _require_observation(self) -> None:
-        if not self._recent:
-            raise UserError("No frame was observed yet: call observe() with the current frame before act().")
+        require(self._recent, "No frame was observed yet: call observe() with the current frame before act().")
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
-        if view not in frames:
-            raise UserError(f"observe() needs the camera {view!r}; got {sorted(frames)}.")
+        require(view in frames, f"observe() needs the camera {view!r}; got {sorted(frames)}.")
         array = np.asarray(frames[view])
-        if array.ndim != 4 or array.shape[-1] != 3 or array.dtype != np.uint8:
-            raise UserError(f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.")
+        require(
+            array.ndim == 4 and array.shape[-1] == 3 and array.dtype == np.uint8,
+            f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.",
+        )
         return array
+
+
+def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) -> ActionPrefix:
+    """A prefix of a chunk of `horizon` actions of `width` numbers."""
+    values = finite_array(actions, "the actions of the prefix")
+    require(
+        values.ndim == 2 and values.shape[1] == width and 1 <= len(values) <= horizon,
+        f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape {values.shape}.",
+    )
+    right = isinstance(delay, int) and not isinstance(delay, bool) and 0 <= delay <= len(values)
+    require(
+        right,
+        f"set_action_prefix(): delay={delay!r} must be a whole number from 0 to {len(values)}, the actions given.",
+    )
+    return ActionPrefix(values, delay)
+
+
+def prefix_overlap(
+    prefixes: Sequence[ActionPrefix | None], states: Tensor, processor: "PolicyProcessor", action_dim: int
+) -> Overlap | None:
+    """The normalised prefixes of n episodes at raw states [n, s]; None if none has one."""
+    if all(prefix is None for prefix in prefixes):
+        return None
+    horizon, width = processor.embodiment.action.horizon, processor.embodiment.action.width
+    actions, weight = torch.zeros(2, len(prefixes), horizon, action_dim)
+    for i, prefix in enumerate(prefixes):
+        if prefix is None:
+            continue
+        count = len(prefix.actions)
+        padded = np.concatenate([prefix.actions, prefix.actions[-1:].repeat(horizon - count, 0)])
+        actions[i] = processor.actions(padded, states[i])
+        weight[i, :, :width] = overlap_weights(prefix.delay, count, horizon)[:, None]
+    return Overlap(actions, weight)

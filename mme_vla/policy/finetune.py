@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
+from mme_vla.errors import UserError, brief, check_choice, did_you_mean, missing_extra, require
 from mme_vla.policy.tensor_files import dtype_of
 
 if TYPE_CHECKING:
@@ -85,8 +85,7 @@ def apply_finetuning(
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
     """
-    if mode not in MODES:
-        raise UserError(f"finetune.mode={mode!r}. {did_you_mean(str(mode), MODES)}")
+    check_choice("finetune.mode", mode, MODES)
     check_frozen_dtype(policy, frozen_dtype)
     spec = policy.finetune_spec
     train = ("memory", *spec.full_train) if train is None else train
@@ -114,11 +113,11 @@ def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
     """Make sure that a policy can compute with frozen weights of this dtype (None: as they are)."""
     if name is None:
         return
-    if dtype_of(name, "finetune.frozen_dtype") != torch.float32 and policy.compute_dtype == torch.float32:
-        raise UserError(
-            f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would not: set "
-            "policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null."
-        )
+    require(
+        not (dtype_of(name, "finetune.frozen_dtype") != torch.float32 and policy.compute_dtype == torch.float32),
+        f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would not: set "
+        "policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null.",
+    )
 
 
 def cast_frozen(policy: "Policy", name: str | None) -> None:
@@ -140,14 +139,13 @@ def add_adapters(
     seed: int = 42,
 ) -> None:
     """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
-    if policy.config.get("adapters") and _has_adapters(policy):
-        raise UserError("This policy has adapters already: merge_adapters() first.")
-    if rank < 1 or alpha <= 0 or not 0 <= dropout < 1:
-        raise UserError(
-            f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0, dropout in [0, 1)."
-        )
-    if init not in INITS:
-        raise UserError(f"finetune.init={brief(init)}. {did_you_mean(str(init), INITS)}")
+    adapted = policy.config.get("adapters") and any(".lora_" in name for name, _ in policy.named_parameters())
+    require(not adapted, "This policy has adapters already: merge_adapters() first.")
+    require(
+        rank >= 1 and alpha > 0 and 0 <= dropout < 1,
+        f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0, dropout in [0, 1).",
+    )
+    check_choice("finetune.init", init, INITS)
     targets = list(policy.finetune_spec.lora_targets if targets is None else targets)
     target_modules = _targets(policy, targets)
     try:
@@ -194,10 +192,6 @@ def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | Non
         reason = brief(str(error), 200, quote=False)
         raise UserError(f"A checkpoint's adapters {brief(adapters)} do not fit its weights ({reason}).") from error
     return merged
-
-
-def _has_adapters(policy: "Policy") -> bool:
-    return any(".lora_" in name for name, _ in policy.named_parameters())
 
 
 def _targets(policy: "Policy", targets: Sequence[str]) -> list[str]:

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.attention import check_backend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets
-from mme_vla.backbone.config import read_backbone, shapes_only
+from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
+from mme_vla.backbone.layers import check_backend
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
@@ -30,18 +30,16 @@ from mme_vla.memory.base import (
 )
 from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.model import MMEModel
-from mme_vla.policy.action_prefix import prefix_overlap
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
-from mme_vla.policy.episode import Episode
+from mme_vla.policy.episode import Episode, prefix_overlap
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recomputes, Sharded
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
 from mme_vla.speed.graphs import CapturedSampling
-from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
 
@@ -181,10 +179,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     def recompute(self, mode: Recompute) -> None:
         if not isinstance(self.backbone, Recomputes):
-            raise UserError(
-                f"train.recompute: {type(self.backbone).__name__} does not inherit from `Recomputes` "
-                "(mme_vla.speed). Set train.recompute=false."
-            )
+            name = type(self.backbone).__name__
+            raise UserError(f"train.recompute: {name} does not inherit from mme_vla.speed.Recomputes. Set it to false.")
         self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
@@ -254,10 +250,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             UserError: this backbone has no sampler that can be captured.
         """
         if not isinstance(self.backbone, CapturableSampling):
-            raise UserError(
-                f"The backbone {type(self.backbone).__name__} has no sampler that can be compiled: leave "
-                "sampling=eager."
-            )
+            name = type(self.backbone).__name__
+            raise UserError(f"The backbone {name} has no sampler that can be compiled: leave sampling=eager.")
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)

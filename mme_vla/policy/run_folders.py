@@ -4,7 +4,7 @@ import re
 from importlib.resources import files
 from pathlib import Path
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 CHECKPOINTS = "checkpoints"
 STATE = "training_state.json"
@@ -47,10 +47,7 @@ def find_run(path: Path) -> Path:
     if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if checkpoints_in(run / CHECKPOINTS)]
-    if not runs:
-        raise UserError(
-            f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another."
-        )
+    require(runs, f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another.")
     return max(runs, key=lambda run: (checkpoints_in(run / CHECKPOINTS)[-1].stat().st_mtime_ns, run.name))
 
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.config import shapes_only
+from mme_vla.backbone.building import shapes_only
 from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
 from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.policy.capabilities import ComparesSizes
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
@@ -52,8 +52,7 @@ DEFAULT = "mme"
 def policy_name(config: Mapping[str, Any]) -> str:
     """What the section `policy` of a configuration calls its class."""
     section = config.get("policy") or {}
-    if not isinstance(section, Mapping):
-        raise UserError(f"policy={brief(section)} must be a section.")
+    require(isinstance(section, Mapping), f"policy={brief(section)} must be a section.")
     return section.get("name", DEFAULT)  # the registry refuses what is no name
 
 
@@ -118,8 +117,7 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
     path = newest_checkpoint(Path(source).expanduser())
     place = _PLACE.fullmatch(str(source))
     if path.exists() or place is None:
-        if revision is not None:
-            raise UserError(f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
+        require(revision is None, f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
         return path
     import httpx
     from huggingface_hub import snapshot_download
@@ -131,8 +129,7 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
             return Path(snapshot_download(repository, revision=revision, token=token))
         patterns = [within, f"{within}/*"]
         root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns))
-        if not (root / within).exists():
-            raise UserError(f"The hub repository {repository} has no {within!r}: nothing of that name was in it.")
+        require((root / within).exists(), f"The hub repository {repository} has nothing called {within!r}.")
         return root / within
     except (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
         at = "" if revision is None else f" at revision {revision!r}"
@@ -148,8 +145,9 @@ def push_folder(
     folder: Path, repo_id: str, *, private: bool, token: str | None, revision: str | None, message: str
 ) -> str:
     """Create the repository if need be, upload the folder's files as one commit, and return its address."""
-    if not _REPOSITORY.fullmatch(repo_id):
-        raise UserError(f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul.")
+    require(
+        _REPOSITORY.fullmatch(repo_id), f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul."
+    )
     import huggingface_hub
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -228,14 +226,13 @@ def load_policy[P: "Policy"](
     from mme_vla.processing.base import load_processor
 
     target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
-    if not (folder / CONFIG).is_file():
-        raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
+    require((folder / CONFIG).is_file(), f"No policy at {source}: it lacks {CONFIG}, which save_pretrained() writes.")
     config = read_config(folder)
-    if "backbone" not in config:
-        raise UserError(
-            f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
-            "are read by mme_vla.weights.load_weights() and converted by mme-vla weights."
-        )
+    require(
+        "backbone" in config,
+        f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
+        "are read by mme_vla.weights.load_weights() and converted by mme-vla weights.",
+    )
     import_trusted(config, str(source), trust_plugins)
     policy_type = policy_class_for(requested, config, str(source))
     on_gpu = torch.device(device).type == "cuda"
@@ -261,8 +258,7 @@ def build_saved[P: "Policy"](
         config: plain sections. source: where they are from, for messages. options: overrides of the section `policy`.
     """
     section = config.get("policy", {})
-    if not isinstance(section, dict):
-        raise UserError(f"{source}: policy={brief(section)} must be a section.")
+    require(isinstance(section, dict), f"{source}: policy={brief(section)} must be a section.")
     config = {**config, "policy": {**section, **(options or {})}}
     try:
         with shapes_only():
@@ -310,16 +306,16 @@ def check_processor(policy: "Policy", source: str) -> None:
     """Make sure that a policy and its processor have the same robot and sizes."""
     processor = policy.require_processor()
     robot = embodiment_of(policy.config)
-    if policy.config.get("embodiment") is not None and robot != processor.embodiment:
-        raise UserError(
-            f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
-            f"{brief(robot.name)}, or they describe it differently. The files are from two checkpoints, or one was "
-            "changed."
-        )
+    require(
+        not (policy.config.get("embodiment") is not None and robot != processor.embodiment),
+        f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
+        f"{brief(robot.name)}, or they describe it differently. The files are from two checkpoints, or one was "
+        "changed.",
+    )
     sizes = policy.processor_sizes() if isinstance(policy, ComparesSizes) else {}
     for name, (actual, expected) in sizes.items():
-        if actual != expected:
-            raise UserError(
-                f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                "from two checkpoints, or one was changed."
-            )
+        require(
+            actual == expected,
+            f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+            "from two checkpoints, or one was changed.",
+        )

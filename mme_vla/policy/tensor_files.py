@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, check_choice, listed, require
 from mme_vla.utils import check_sums, inside, read_json
 
 WEIGHTS = "model.safetensors"
@@ -44,8 +44,7 @@ def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
     for file in files:
         loaded = read_safetensors(file)
         twice = sorted(set(loaded) & set(tensors))
-        if twice:
-            raise UserError(f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.")
+        require(not twice, f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.")
         tensors |= loaded
     return tensors
 
@@ -55,9 +54,9 @@ def weight_files(folder: Path) -> list[Path]:
     if (folder / INDEX).is_file():
         check_sums(folder, [INDEX])
         table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
-        names = set(table.values()) if isinstance(table, dict) and _all_texts(table) else set()
-        if not names:
-            raise UserError(f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
+        names = set(table.values()) if isinstance(table, dict) else set()
+        texts = names and all(isinstance(name, str) for name in names)
+        require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
         return [inside(folder, name, "weights") for name in sorted(names)]
     if (folder / WEIGHTS).is_file():
         return [inside(folder, WEIGHTS, "weights")]
@@ -86,18 +85,17 @@ def check_header(file: Path) -> None:
     """Make sure that a safetensors file is one, and that its header is of a size worth parsing."""
     try:
         about = file.stat()
-        if not stat.S_ISREG(about.st_mode):
-            raise UserError(f"{file} is not a file; expected safetensors.")
+        require(stat.S_ISREG(about.st_mode), f"{file} is not a file; expected safetensors.")
         with file.open("rb") as opened:
             header = int.from_bytes(opened.read(8), "little")
     except OSError as error:
         label = brief(str(file), 300, quote=False)  # an index may give a name of any length
         raise UserError(f"{label} cannot be read as a safetensors file: {error.strerror or error}.") from None
-    if header > min(_HEADER_LIMIT, about.st_size - 8):
-        raise UserError(
-            f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "
-            f"{about.st_size:,}, and headers have at most {_HEADER_LIMIT:,}."
-        )
+    require(
+        header <= min(_HEADER_LIMIT, about.st_size - 8),
+        f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "
+        f"{about.st_size:,}, and headers have at most {_HEADER_LIMIT:,}.",
+    )
 
 
 def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
@@ -107,8 +105,7 @@ def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
 
 def dtype_of(name: str, what: str = "dtype") -> torch.dtype:
     """Look up `float32` or `bfloat16`."""
-    if not isinstance(name, str) or name not in DTYPES:
-        raise UserError(f"{what}={brief(name)}: choose one of {', '.join(DTYPES)}.")
+    check_choice(what, name, DTYPES)
     return DTYPES[name]
 
 
@@ -130,18 +127,17 @@ def check_fit(
         for what, names in (("missing", missing), ("unexpected", unexpected), ("misshapen", misshapen))
         if names
     ]
-    if problems:
-        raise UserError(f"The weights in {source} do not fit this policy.\n" + "\n".join(problems))
+    require(not problems, f"The weights in {source} do not fit this policy.\n" + "\n".join(problems))
 
 
 def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
     """Make sure that tensors hold numbers a network can compute with."""
     broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
-    if broken:
-        raise UserError(
-            f"{source} holds NaN or infinities in {len(broken):,} tensors: {listed(sorted(broken), 5)}. Its actions "
-            "would mean nothing: the training diverged or the file is damaged; take an earlier checkpoint."
-        )
+    require(
+        not broken,
+        f"{source} holds NaN or infinities in {len(broken):,} tensors: {listed(sorted(broken), 5)}. Its actions "
+        "would mean nothing: the training diverged or the file is damaged; take an earlier checkpoint.",
+    )
 
 
 def assign_tensors(
@@ -180,8 +176,7 @@ def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], s
         for name, tensor in tensors.items()
         if name in expected and _kind(tensor) != _kind(expected[name])
     ]
-    if wrong:
-        raise UserError(f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.")
+    require(not wrong, f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.")
 
 
 def replace_folder(built: Path, target: Path) -> None:
@@ -192,10 +187,6 @@ def replace_folder(built: Path, target: Path) -> None:
         target.rename(old)
     built.rename(target)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _all_texts(table: Mapping[str, object]) -> bool:
-    return all(isinstance(name, str) for name in table.values())
 
 
 def _kind(tensor: Tensor) -> str:

@@ -1,15 +1,17 @@
 """Arms of a probe: interventions alone or together (`drop:2`, `nodemo+shuffle`)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, is_dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, brief
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.feed import Feed
 from mme_vla.policy.base import Policy
-from mme_vla.probing.channels import Channel, NoChannel, Remembered
+from mme_vla.probing.channels import Channel, Remembered
 from mme_vla.probing.interventions import NEEDS, Intervention, Moment
 from mme_vla.registry import INTERVENTIONS
 
@@ -30,10 +32,7 @@ class Arm:
     @property
     def feed(self) -> Feed:
         """What the policy observes."""
-        feed = Feed()
-        for part in self.parts:
-            feed = part.feed(feed)
-        return feed
+        return reduce(lambda feed, part: part.feed(feed), self.parts, Feed())
 
     @property
     def needs(self) -> frozenset[str]:
@@ -49,24 +48,17 @@ class Arm:
         allowed = [frames for part in self.parts if (frames := part.only(moment)) is not None]
         if not allowed:
             return None
-        both = allowed[0]
-        for frames in allowed[1:]:
-            both = np.intersect1d(both, frames)
-        if not len(both):
-            raise UserError(f"{self.name} leaves no frame to remember: its parts allow different ones.")
+        both: np.ndarray = reduce(np.intersect1d, allowed)
+        require(len(both), f"{self.name} leaves no frame to remember: its parts allow different ones.")
         return both
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         """What is remembered instead."""
-        for part in self.parts:
-            store = part.edit(store, moment)
-        return store
+        return reduce(lambda edited, part: part.edit(edited, moment), self.parts, store)
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         """The subgoal that the policy reads instead."""
-        for part in self.parts:
-            subgoal = part.say(subgoal, moment)
-        return subgoal
+        return reduce(lambda said, part: part.say(said, moment), self.parts, subgoal)
 
     def dial(self) -> float | None:
         """Where the arm stands on its dial, if it is one intervention with a number for one."""
@@ -82,9 +74,8 @@ UNPROBED = Arm("unprobed")
 def read_arm(spec: Any) -> Arm:
     """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`."""
     if isinstance(spec, Mapping):
-        part: Intervention = INTERVENTIONS.build(spec)
         options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
-        return Arm(f"{spec['name']}({options})" if options else str(spec["name"]), (part,))
+        return Arm(f"{spec.get('name')}({options})" if options else str(spec.get("name")), (_build(spec),))
     if not isinstance(spec, str) or not spec:
         raise UserError(f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop, …}}.")
     return Arm(spec, tuple(_read_part(word) for word in spec.split("+")))
@@ -92,17 +83,21 @@ def read_arm(spec: Any) -> Arm:
 
 def _read_part(word: str) -> Intervention:
     name, _, value = word.partition(":")
-    entry = INTERVENTIONS[name]
+    dial = INTERVENTIONS[name].dial
     if not value:
-        built: Intervention = INTERVENTIONS.build({"name": name})
-        return built
-    if entry.dial is None:
-        raise UserError(f"{word!r}: the intervention {name} has no dial; write {name}.")
-    number = value.removeprefix("-")
-    if value != "all" and not number.isdecimal():
-        raise UserError(f"{word!r}: the dial {entry.dial} of {name} is a whole number, or all where it counts.")
-    made: Intervention = INTERVENTIONS.build({"name": name, entry.dial: None if value == "all" else int(value)})
-    return made
+        return _build({"name": name})
+    if dial is None or (value != "all" and not value.removeprefix("-").isdecimal()):
+        allowed = f"{name}:<{dial}>, a whole number, or all where it counts" if dial else f"{name}, which has no dial"
+        raise UserError(f"{word!r}: write {allowed}.")
+    return _build({"name": name, dial: None if value == "all" else int(value)})
+
+
+def _build(section: Mapping[str, Any]) -> Intervention:
+    entry: Any = INTERVENTIONS[section.get("name")]  # type: ignore[index]
+    options = {key: value for key, value in section.items() if key != "name"}
+    if not is_dataclass(entry):
+        return INTERVENTIONS.build(section)
+    return read_section(entry, options, section["name"])  # type: ignore[arg-type, return-value]
 
 
 def read_arms(specs: Any) -> list[Arm]:
@@ -118,12 +113,11 @@ def read_arms(specs: Any) -> list[Arm]:
 def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool) -> str | None:
     """What an arm needs and lacks, for a message; None where it can be probed.
 
-    Args:
-        recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
+    recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
     """
     robot = policy.embodiment
     there = {
-        "entries": not isinstance(channel, NoChannel),
+        "entries": type(channel) is not Channel,
         "choice": channel.chooses,
         "clock": channel.clock is not None,
         "pauses": channel.sees_pauses,
@@ -157,11 +151,7 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
-    options: list[dict[str, Any]] = []
-    for part in arm.parts:
-        names: list[str] = [option.name for option in fields(part)] if is_dataclass(part) else []
-        options.append({"intervention": type(part).__name__, **{name: getattr(part, name) for name in names}})
-    return options
+    return [{"intervention": type(part).__name__, **vars(part)} for part in arm.parts]
 
 
 def slug(name: str) -> str:

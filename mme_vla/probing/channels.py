@@ -80,8 +80,7 @@ def same_progress(slots: Sequence[int], count: int) -> np.ndarray:
     return np.linspace(0, max(count - 1, 0), max(len(slots), 1)).round().astype(int)[: len(slots)]
 
 
-Place = tuple[History, int]
-"""A frame of a history."""
+Place = tuple[History, int]  # A frame of a history
 
 
 class OnlyFrames(History):
@@ -154,27 +153,32 @@ class MemorySnapshot:
 
 
 class Channel:
-    """One way to what a policy remembers. `clock`: what the times of its entries count; None where they have none."""
+    """One way to what a policy remembers; this one for a policy without a memory that a probe can reach.
 
-    clock: str | None = "frames"
+    clock: what the times of its entries count; None where they have none. sees_pauses: whether frames at which nothing
+    is decided reach this memory. chooses: whether the memory chooses among frames, so that it can be given fewer.
+    """
+
+    clock: str | None = None
     sees_pauses = True
-    """Whether frames at which nothing is decided reach this memory."""
-    chooses = True
-    """Whether the memory chooses among frames, so that it can be given fewer."""
+    chooses = False
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
 
     def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
         """What is remembered at `step` (by default now), choosing among the frames `only` where they are given."""
-        raise NotImplementedError
+        return MemorySnapshot(())
 
     def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
-        """What `answer` takes for an episode that remembers `stores` instead."""
-        raise NotImplementedError
+        """What `predict_chunk` takes for an episode that remembers `stores` instead."""
+        return episode
 
     def predict_chunk(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        """Normalised chunks [n, h, a] for what `observation` saw of n episodes, through what `as_if` made of them."""
-        raise NotImplementedError
+        """Normalised chunks [n, h, a] for a batch of n episodes, through what `counterfactual` made of them."""
+        return self._policy.predict_chunk(batch, remembering, draws, steps)
 
     def commit(self, episode: Episode, remembering: Any) -> None:
         """Let the real episode continue from a chunk that was chosen so."""
@@ -186,14 +190,16 @@ class SelectionChannel(Channel):
     They may stand behind any network whose batch has a `history`.
     """
 
+    clock, chooses = "frames", True
+
     def __init__(self, policy: Policy) -> None:
-        self._policy, self._memory = policy, with_vision_memory(policy).require_memory()
+        super().__init__(policy)
+        self._memory = with_vision_memory(policy).require_memory()
 
     def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
         full = episode.required_history()
         now = len(full) - 1 if step is None else step
-        if only is not None and step is not None:
-            raise ValueError("Choosing among some frames is for the current one.")
+        assert only is None or step is None, "choosing among some frames is for the current one"
         view: History = full if only is None else OnlyFrames(full, only)
         at = now if only is None else len(view) - 1
         names = view.frames if isinstance(view, OnlyFrames) else {}
@@ -226,10 +232,11 @@ class SelectionChannel(Channel):
 class WritableChannel(Channel):
     """Episodes that write a memory of their own (`policy/episode.py`), where chunks are chosen."""
 
-    sees_pauses, chooses = False, False
+    sees_pauses = False
 
     def __init__(self, policy: Policy, clock: str | None) -> None:
-        self._policy, self.clock = policy, clock
+        super().__init__(policy)
+        self.clock = clock
 
     def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
         assert isinstance(episode, WritableMemory)
@@ -244,34 +251,9 @@ class WritableChannel(Channel):
         entries = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
         return episode.with_entries(entries)
 
-    def predict_chunk(
-        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
-    ) -> Tensor:
-        return self._policy.predict_chunk(batch, remembering, draws, steps)
-
     def commit(self, episode: Episode, remembering: Any) -> None:
         assert isinstance(episode, WritableMemory)
         episode.resume_from(remembering)
-
-
-class NoChannel(Channel):
-    """A policy without a memory that a probe can reach: its frames and its subgoal can be changed."""
-
-    clock, chooses = None, False
-
-    def __init__(self, policy: Policy) -> None:
-        self._policy = policy
-
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
-        return MemorySnapshot(())
-
-    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Episode:
-        return episode
-
-    def predict_chunk(
-        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
-    ) -> Tensor:
-        return self._policy.predict_chunk(batch, remembering, draws, steps)
 
 
 def channel_of(policy: Policy) -> Channel:
@@ -279,4 +261,4 @@ def channel_of(policy: Policy) -> Channel:
     if policy.memory is not None:
         return SelectionChannel(policy)
     episode = policy.start_episode("")
-    return WritableChannel(policy, episode.memory_clock) if isinstance(episode, WritableMemory) else NoChannel(policy)
+    return WritableChannel(policy, episode.memory_clock) if isinstance(episode, WritableMemory) else Channel(policy)

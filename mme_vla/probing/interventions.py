@@ -6,11 +6,12 @@ One of your own is a class registered with `register("intervention", name)` in a
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.config.sections import NonNegativeInt, PositiveInt
+from mme_vla.errors import UserError
 from mme_vla.evaluation.feed import Feed
 from mme_vla.probing.channels import Remembered, same_progress
 from mme_vla.registry import INTERVENTIONS
@@ -77,15 +78,6 @@ class Intervention:
         return subgoal
 
 
-def check_integer(name: str, value: Any, least: int) -> None:
-    """Make sure that a dial is a whole number."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise UserError(f"{name}={value!r} must be a whole number, at least {least}.")
-
-
-WHICH = ("oldest", "newest", "random", "used")
-
-
 @INTERVENTIONS.register("shuffle")
 @dataclass(frozen=True)
 class Shuffle(Intervention):
@@ -108,16 +100,10 @@ class Drop(Intervention):
     absence changes the chunk most (an attention that any integration has).
     """
 
-    count: int | None = 1
-    which: str = "random"
+    count: PositiveInt | None = 1
+    which: Literal["oldest", "newest", "random", "used"] = "random"
     dial: ClassVar = "count"
     needs: ClassVar = frozenset({"entries"})
-
-    def __post_init__(self) -> None:
-        if self.count is not None:
-            check_integer("drop.count", self.count, 1)
-        if self.which not in WHICH:
-            raise UserError(f"drop.which={self.which!r}. {did_you_mean(str(self.which), WHICH)}")
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         slots = store.occupied
@@ -133,13 +119,9 @@ class Swap(Intervention):
     count: how many, at random; None swaps all.
     """
 
-    count: int | None = None
+    count: PositiveInt | None = None
     dial: ClassVar = "count"
     needs: ClassVar = frozenset({"entries", "recordings"})
-
-    def __post_init__(self) -> None:
-        if self.count is not None:
-            check_integer("swap.count", self.count, 1)
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         occupied, donor = store.occupied, moment.donor(store.name)
@@ -176,12 +158,9 @@ class Delay(Intervention):
 class Recent(Intervention):
     """The memory chooses among the last `frames` frames alone, at the times at which they were."""
 
-    frames: int = 64
+    frames: PositiveInt = 64
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"entries", "choice"})
-
-    def __post_init__(self) -> None:
-        check_integer("recent.frames", self.frames, 1)
 
     def only(self, moment: Moment) -> np.ndarray | None:
         inside = moment.stored[moment.stored > moment.now - self.frames]
@@ -206,8 +185,8 @@ class Oracle(Intervention):
 class Pause(Intervention):
     """One frame is repeated `frames` times more. `at`: which, from the first execution frame on."""
 
-    frames: int = 64
-    at: int = 0
+    frames: NonNegativeInt = 64
+    at: NonNegativeInt = 0
     dial: ClassVar = "frames"
     needs: ClassVar = frozenset({"pauses"})
 
@@ -220,7 +199,7 @@ class Pause(Intervention):
 class Distract(Intervention):
     """So many unrelated recorded episodes are seen first, as if they were part of the video."""
 
-    sessions: int = 1
+    sessions: NonNegativeInt = 1
     dial: ClassVar = "sessions"
     needs: ClassVar = frozenset({"recordings"})
 
@@ -283,12 +262,9 @@ class SubgoalSwap(Intervention):
 class SubgoalDelay(Intervention):
     """The subgoal of `decisions` chunks ago; the first one until then."""
 
-    decisions: int = 2
+    decisions: PositiveInt = 2
     dial: ClassVar = "decisions"
     needs: ClassVar = frozenset({"subgoal"})
-
-    def __post_init__(self) -> None:
-        check_integer("subgoal_delay.decisions", self.decisions, 1)
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return moment.subgoals[max(len(moment.subgoals) - 1 - self.decisions, 0)] if moment.subgoals else subgoal

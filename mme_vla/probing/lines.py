@@ -11,8 +11,7 @@ from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief
 from mme_vla.utils import parse_json, read_lines, verified, with_checksum
 
-LINES = "offline*.jsonl"
-"""The files of all shards."""
+LINES = "offline*.jsonl"  # The files of all shards
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import NonNegativeInt, PositiveInt, read_section
 from mme_vla.evaluation.feed import Feed
 from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.rollout.episode import episode_seed
@@ -18,7 +18,6 @@ from mme_vla.policy.base import Policy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import UNPROBED, Arm
 from mme_vla.probing.channels import MemorySnapshot
-from mme_vla.probing.interventions import check_integer
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
 from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy, others
 from mme_vla.processing.prompt import subgoal_kind
@@ -64,16 +63,11 @@ class OfflineSettings:
     scan: whether each entry is left out by itself. flow_steps: of the sampler; None for the policy's own.
     """
 
-    seed: int = 42
-    draws: int = 8
-    moments: int | None = 8
+    seed: NonNegativeInt = 42
+    draws: PositiveInt = 8
+    moments: PositiveInt | None = 8
     scan: bool = True
     flow_steps: int | None = None
-
-    def __post_init__(self) -> None:
-        least = {"seed": 0, "draws": 1, **({} if self.moments is None else {"moments": 1})}
-        for name, smallest in least.items():
-            check_integer(name, getattr(self, name), smallest)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -92,9 +86,8 @@ def probe_offline(
 ) -> list[Line]:
     """Probe every recorded episode that the file holds no lines of yet; all its lines, old and new.
 
-    Args:
-        recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines.
-        after: called after each episode with 1.
+    recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines. after: called
+    after each episode with 1.
     """
     _, done = lines.read(path)
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
@@ -128,8 +121,7 @@ class _Moments:
         for arm in [UNPROBED, *arms]:
             self._by_feed[arm.feed].append(ProbedPolicy(policy, arm, sessions, donors).eval())
         self._draws = self._shared_noise()
-        self._baseline: dict[int, Tensor] = {}
-        """Unprobed chunks [draws, h, w] of each step."""
+        self._baseline: dict[int, Tensor] = {}  # Unprobed chunks [draws, h, w] of each step
 
     def lines(self) -> list[Line]:
         """All lines."""

@@ -120,8 +120,7 @@ class ProbedPolicy(FedPolicy):
     ) -> None:
         """Wrap a policy.
 
-        Args:
-            sessions: recorded episodes to observe before each, as many as the arm needs. donors: to take contents from.
+        sessions: recorded episodes to observe before each, as many as the arm needs. donors: to take contents from.
         """
         super().__init__(inner, arm.feed, sessions)
         self.arm, self.channel, self.donors = arm, channel_of(inner), donors
@@ -205,9 +204,8 @@ class ProbedPolicy(FedPolicy):
     ) -> Tensor:
         """Normalised chunks [variants, draws, h, w] as they are executed, adding nothing to the episode's memory.
 
-        Args:
-            variants: what is remembered, store by store. draws: the random numbers that all variants share.
-            batch: most chunks that are chosen at once.
+        variants: what is remembered, store by store. draws: the random numbers that all variants share. batch: most
+        chunks that are chosen at once.
         """
         chunks = []
         pairs = [(variant, sampled) for variant in variants for sampled in draws]

@@ -31,8 +31,7 @@ MEASURES = {
     "interference": ("distract:1", "one unrelated episode first"),
 }
 """What a probe's table has one column for: the arm that measures it, and what that does."""
-AGES = (0, 16, 32, 64, 128, 256, 512)
-"""Where the bins of an entry's age begin, in frames."""
+AGES = (0, 16, 32, 64, 128, 256, 512)  # Where the bins of an entry's age begin, in frames
 
 
 @dataclass(frozen=True)
@@ -234,8 +233,7 @@ UNITS = (
 def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
     """The frames remembered at a step, each with its age and how the chunk changes without it; the current one last.
 
-    Args:
-        lines: of one step. recording: theirs.
+    lines: of one step. recording: theirs.
     """
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):

@@ -2,22 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mme_vla.config.sections import read_section
 from mme_vla.data.console import progress
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.make import make_env, require_simulator
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError
 from mme_vla.evaluation.api import load
 from mme_vla.evaluation.recordings import Recording, all_recordings
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.evaluation import Shard, checkpoint_label, choose_episodes, evaluate, memory_budget
+from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, facts_of
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import claim_run, find_records, fingerprint, read_folders
@@ -30,8 +31,7 @@ from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.probing.report import Findings, write_images, write_page
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 
-OFFLINE, ONLINE = "offline", "online"
-"""Folders of the lines and of the closed loop."""
+OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
 NO_DATA = (
     "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made by "
     "`mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false online=true "
@@ -172,28 +172,20 @@ def probe(
     Returns:
         Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
 
-    Raises:
-        UserError: nothing to probe on, an intervention that does not exist or does not fit, or a setting likewise.
-
     >>> probe("outputs/mine/latest", "outputs/val", output="outputs/probe").page  # doctest: +SKIP
     """
-    known = [option.name for option in fields(RolloutSettings) if option.name != "seed"]
-    if unknown := [key for key in settings if key not in known]:
-        raise UserError(f"probe() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
+    run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
     if recordings is None and tasks is None:
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
-    run_settings = RolloutSettings(seed=seed, **settings)
     loaded, source = load(policy)
     recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split)
     if jobs and base is make_env and run_settings.env == "mme_vla":
         require_simulator()
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
-    facts = RunFacts(
-        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, run_settings.split,
-        run_settings.max_steps, subgoal if isinstance(subgoal, str) else None, memory_budget(loaded),
-    )  # fmt: skip
-    plan = ProbePlan(arms, recorded, recorded, jobs, OfflineSettings(seed, draws, moments), source=source)
+    facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
+    offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source)
     folder = Path(output).expanduser()
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress
@@ -208,8 +200,7 @@ def named(model: str, arm: Arm) -> str:
 def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
     """Each arm against the unprobed run, over the episodes that both have, corrected for their number.
 
-    Args:
-        model: the unprobed one's name.
+    model: the unprobed one's name.
     """
     tasks = tuple(dict.fromkeys(record.task for record in records))
     if not tasks:

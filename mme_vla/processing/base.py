@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import stack_history
 from mme_vla.processing.images import stack_past
 from mme_vla.processing.normalise import NormStats, normalize
@@ -122,10 +122,12 @@ class PolicyProcessor:
     @stats.setter
     def stats(self, stats: NormStats | None) -> None:
         robot = self.embodiment
-        if stats is not None and (len(stats.state), len(stats.actions)) != (robot.state.width, robot.action.width):
-            raise UserError(
-                f"Statistics of {len(stats.state)}-number states and {len(stats.actions)}-number actions are not those "
-                f"of {robot.name!r}, which has {robot.state.width} and {robot.action.width}: give this robot's."
+        if stats is not None:
+            widths = len(stats.state), len(stats.actions)
+            require(
+                widths == (robot.state.width, robot.action.width),
+                f"Statistics of {widths[0]}-number states and {widths[1]}-number actions are not those of "
+                f"{robot.name!r}, which has {robot.state.width} and {robot.action.width}: give this robot's.",
             )
         self._stats = stats
 
@@ -242,8 +244,9 @@ def motion_rows(processor: PolicyProcessor, states: np.ndarray, actions: np.ndar
 
 def read_settings(folder: Path) -> dict[str, Any]:
     """Read `processor.json` of a checkpoint."""
-    if not (folder / CONFIG_FILE).is_file():
-        raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
+    require(
+        (folder / CONFIG_FILE).is_file(), f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library."
+    )
     check_sums(folder, [CONFIG_FILE])
     settings: dict[str, Any] = read_json(inside(folder, CONFIG_FILE), "a processor's settings", limit=2**20)
     return settings

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import PastViewSpec
 from mme_vla.types import FrameBatch, PastViews
 
@@ -29,8 +29,10 @@ def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np
     """
     from PIL import Image
 
-    if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3:
-        raise UserError(f"Expected uint8 images [..., height, width, 3], got {frames.dtype} {list(frames.shape)}.")
+    require(
+        frames.dtype == np.uint8 and frames.ndim >= 3 and frames.shape[-1] == 3,
+        f"Expected uint8 images [..., height, width, 3], got {frames.dtype} {list(frames.shape)}.",
+    )
     height, width = _pair(size)
     if frames.shape[-3:-1] == (height, width):
         return frames
@@ -52,10 +54,13 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
     Returns:
         [n, 3, h, w] float32 in [-1, 1], on the device of `images`.
     """
-    if images.ndim != 4 or images.shape[-1] != 3:
-        raise UserError(f"Expected images [n, height, width, 3], got {list(images.shape)}.")
-    if images.dtype != torch.uint8 and not images.is_floating_point():
-        raise UserError(f"Expected images as uint8, or as float in [-1, 1]; got {images.dtype}.")
+    require(
+        images.ndim == 4 and images.shape[-1] == 3, f"Expected images [n, height, width, 3], got {list(images.shape)}."
+    )
+    require(
+        not (images.dtype != torch.uint8 and not images.is_floating_point()),
+        f"Expected images as uint8, or as float in [-1, 1]; got {images.dtype}.",
+    )
     height, width = _pair(size)
     channels_first = images.movedim(-1, 1)
     source = to_unit_range(channels_first) if images.dtype == torch.uint8 else channels_first.float()
@@ -79,21 +84,20 @@ def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
     Accepts uint8, or float in [0, 1] (mapped by truncating 255·x, as released), with the channels last or first.
     """
     array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
-    if array.ndim not in (3, 4):
-        raise UserError(f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}.")
+    require(
+        array.ndim in (3, 4), f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}."
+    )
     if array.shape[-1] != 3 and array.shape[-3] == 3:
         array = np.moveaxis(array, -3, -1)
-    if array.shape[-1] != 3:
-        raise UserError(f"Expected RGB images (three channels first or last), got shape {list(array.shape)}.")
+    require(array.shape[-1] == 3, f"Expected RGB images (three channels first or last), got shape {list(array.shape)}.")
     if np.issubdtype(array.dtype, np.floating):
-        if array.size and not (array.min() >= 0 and array.max() <= 1):
-            raise UserError(
-                f"Float images must lie in [0, 1], got values from {array.min():g} to {array.max():g}; "
-                "give uint8 images or divide by 255."
-            )
+        low, high = (array.min(), array.max()) if array.size else (0, 0)
+        require(
+            low >= 0 and high <= 1,
+            f"Float images must lie in [0, 1], got values from {low:g} to {high:g}: divide by 255.",
+        )
         return (255 * array).astype(np.uint8)
-    if array.dtype != np.uint8:
-        raise UserError(f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.")
+    require(array.dtype == np.uint8, f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.")
     return array
 
 
@@ -209,8 +213,10 @@ def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -
     Returns:
         [b, v, 3, s, s] float32 in [-1, 1].
     """
-    if images.ndim != 5 or images.shape[2] != 3 or images.shape[-1] != images.shape[-2]:
-        raise UserError(f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.")
+    require(
+        images.ndim == 5 and images.shape[2] == 3 and images.shape[-1] == images.shape[-2],
+        f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.",
+    )
     if images.shape[1] != len(augmentations):
         raise UserError(f"Got {images.shape[1]} views but {len(augmentations)} cameras are described.")
     symmetric = draws[:, :6] * 2 - 1

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import read_json
 
 EPSILON = 1e-6  # keeps a dimension that never moves finite
@@ -67,10 +67,10 @@ class QuantileStats:
             arrays[field.name] = array
         if len({len(array) for array in arrays.values()}) > 1:
             raise UserError(f"{name}: the lists have different lengths { {k: len(v) for k, v in arrays.items()} }.")
-        if (arrays["q99"] < arrays["q01"]).any():
-            raise UserError(f"{name}: q99 lies below q01 in a dimension; the statistics are damaged.")
-        if "min" in arrays and "max" in arrays and (arrays["max"] < arrays["min"]).any():
-            raise UserError(f"{name}: max lies below min in a dimension; the statistics are damaged.")
+        for low, high in (("q01", "q99"), ("min", "max")):
+            if high in arrays and low in arrays:
+                ordered = (arrays[low] <= arrays[high]).all()
+                require(ordered, f"{name}: {high} lies below {low} in a dimension; the statistics are damaged.")
         return cls(**arrays)
 
 
@@ -80,6 +80,15 @@ class NormStats:
 
     state: QuantileStats
     actions: QuantileStats
+
+    @classmethod
+    def unit(cls, state_width: int, action_width: int) -> Self:
+        """Statistics that leave numbers about as they are: −1 and 1 stay."""
+        sides = []
+        for width in (state_width, action_width):
+            ones = np.ones(width)
+            sides.append(QuantileStats(0 * ones, ones.copy(), -ones, ones, -ones, ones))
+        return cls(*sides)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout of openpi's `norm_stats.json`."""
@@ -102,8 +111,7 @@ class NormStats:
     @classmethod
     def load(cls, path: Path | str) -> Self:
         path = Path(path)
-        if not path.is_file():
-            raise UserError(f"No normalisation statistics at {path}.")
+        require(path.is_file(), f"No normalisation statistics at {path}.")
         data = read_json(path, "normalisation statistics", limit=2**24)
         try:
             return cls.from_dict(data)
@@ -132,10 +140,10 @@ def unnormalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tenso
 
 
 def _range(x: Tensor, stats: QuantileStats, by: str) -> tuple[Tensor, Tensor]:
-    if not x.is_floating_point():
-        raise UserError(f"Only floating-point values can be normalised, got {x.dtype}.")
-    if x.shape[-1] < len(stats):
-        raise UserError(f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}.")
+    require(x.is_floating_point(), f"Only floating-point values can be normalised, got {x.dtype}.")
+    require(
+        x.shape[-1] >= len(stats), f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}."
+    )
     low, high = stats.bounds(by)
     return x.new_tensor(low), x.new_tensor(high - low + EPSILON)
 
@@ -153,8 +161,7 @@ class ExactStats:
     def result(self, extremes: bool = False) -> QuantileStats:
         """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
         count = sum(map(len, self._rows))
-        if count < 2:
-            raise UserError(f"Statistics need at least two rows, got {count}.")
+        require(count >= 2, f"Statistics need at least two rows, got {count}.")
         rows = np.concatenate(self._rows)
         q01, q99 = np.quantile(rows, [0.01, 0.99], axis=0)
         ends = (rows.min(0), rows.max(0)) if extremes else ()
@@ -188,8 +195,7 @@ class RunningStats:
         rows = rows.reshape(-1, rows.shape[-1])
         if not len(rows):
             return
-        if not np.isfinite(rows).all():
-            raise UserError("Statistics need finite values, but the data contain NaN or infinity.")
+        require(np.isfinite(rows).all(), "Statistics need finite values, but the data contain NaN or infinity.")
         low, high = rows.min(0), rows.max(0)
         if self._count == 0:
             self._mean, self._square = np.zeros((2, rows.shape[1]))
@@ -211,8 +217,7 @@ class RunningStats:
 
     def result(self, extremes: bool = False) -> QuantileStats:
         """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
-        if self._count < 2:
-            raise UserError(f"Statistics need at least two rows, got {self._count}.")
+        require(self._count >= 2, f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
         ends = (self._low.copy(), self._high.copy()) if extremes else ()
         return QuantileStats(self._mean.copy(), std, self._quantile(0.01), self._quantile(0.99), *ends)

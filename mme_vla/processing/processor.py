@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.config import shape_of
+from mme_vla.backbone.building import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.errors import UserError, brief, check_whole, did_you_mean, listed, require
 from mme_vla.processing.base import (
     CONFIG_FILE,
     STATS_FILE,
@@ -47,8 +47,7 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
         if key not in known:
             raise UserError(f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}")
     for key in ("image_size", "tokenizer"):
-        if key not in settings:
-            raise UserError(f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
+        require(key in settings, f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
     PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
     fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
     if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
@@ -56,11 +55,11 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
     if (robot := settings.pop("embodiment", None)) is not None:
         settings["embodiment"] = Embodiment.from_dict(robot)
     tokenizer = Tokenizer.load(settings.pop("tokenizer"))
-    if fingerprint is not None and tokenizer.fingerprint != fingerprint:
-        raise UserError(
-            f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {brief(fingerprint)} "
-            "was used in training: its ids would mean other words. Give the file that was used."
-        )
+    require(
+        not (fingerprint is not None and tokenizer.fingerprint != fingerprint),
+        f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {brief(fingerprint)} "
+        "was used in training: its ids would mean other words. Give the file that was used.",
+    )
     stats = None if stats is None else NormStats.load(stats)
     return {**settings, "tokenizer": tokenizer, "stats": stats}
 
@@ -82,8 +81,7 @@ def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]
 
 def saved_file(folder: Path, name: Any, what: str) -> Path:
     """The path of a file that a checkpoint names in itself, compared with its checksum where there is one."""
-    if not isinstance(name, str):
-        raise UserError(f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
+    require(isinstance(name, str), f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
     path = inside(folder, name, what)
     check_sums(folder, [name])
     return path
@@ -102,9 +100,6 @@ def saved_tokenizer(folder: Path, name: Any) -> str | Path:
             f"file into the folder as {TOKENIZER_FILE}."
         )
     return saved_file(folder, name, "tokenizer")
-
-
-LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
 
 
 @PROCESSORS.register("pi05")
@@ -143,10 +138,8 @@ class Processor(PolicyProcessor):
             **({} if subgoal_length is None else {"subgoal_length": subgoal_length}),
         }
         for name, value in sizes.items():
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST:
-                raise UserError(f"processor.{name} must be a positive whole number to {LARGEST}, not {brief(value)}.")
-        if not isinstance(prompt, str):
-            raise UserError(f"processor.prompt must be a name, got {brief(prompt)}.")
+            check_whole(f"processor.{name}", value)
+        require(isinstance(prompt, str), f"processor.prompt must be a name, got {brief(prompt)}.")
         self.prompt_format = PROMPTS[prompt]()
         self.prompt_name = prompt
         self.tokenizer = tokenizer
@@ -165,11 +158,11 @@ class Processor(PolicyProcessor):
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
         processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
         vocab_size = sections["backbone"].get("vocab_size")
-        if vocab_size is not None and processor.tokenizer.vocab_size > vocab_size:
-            raise UserError(
-                f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-                f"backbone.vocab_size={vocab_size}: choose the processor that goes with the backbone."
-            )
+        require(
+            not (vocab_size is not None and processor.tokenizer.vocab_size > vocab_size),
+            f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
+            f"backbone.vocab_size={vocab_size}: choose the processor that goes with the backbone.",
+        )
         return processor
 
     @property
@@ -195,8 +188,7 @@ class Processor(PolicyProcessor):
             [v, 3, s, s] uint8, or [n, v, 3, s, s].
         """
         names = self.embodiment.camera_names
-        if len(views) != len(names):
-            raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
+        require(len(views) == len(names), f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
         if len({view.shape for view in resized}) > 1:
             raise UserError(f"All views need as many images, got shapes {[list(view.shape) for view in resized]}.")
@@ -252,11 +244,11 @@ class Processor(PolicyProcessor):
         stats = self.require_stats()
         chunk, state = _float(chunk), _float(state)
         horizon = self.embodiment.action.horizon
-        if chunk.shape != (horizon, len(stats.actions)) or state.shape != (len(stats.state),):
-            raise UserError(
-                f"Expected actions [{horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
-                f"got {list(chunk.shape)} and {list(state.shape)}."
-            )
+        require(
+            chunk.shape == (horizon, len(stats.actions)) and state.shape == (len(stats.state),),
+            f"Expected actions [{horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
+            f"got {list(chunk.shape)} and {list(state.shape)}.",
+        )
         relative = self.embodiment.action.to_relative(chunk, state)
         return pad_width(normalize(relative, stats.actions), self.action_dim)
 

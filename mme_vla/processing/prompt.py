@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, check_choice, require
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import Registry
 from mme_vla.utils import is_text
@@ -165,8 +165,7 @@ def checked_text(text: object, what: str) -> str:
     """`text`, if a tokenizer can take it."""
     if not isinstance(text, str):
         raise UserError(f"{what} must be a text, got {brief(text)}.")
-    if not is_text(text):
-        raise UserError(f"{what} holds half a character (a lone surrogate), which cannot be written: {brief(text)}.")
+    require(is_text(text), f"{what} holds half a character (a lone surrogate), which cannot be written: {brief(text)}.")
     return text
 
 
@@ -242,12 +241,10 @@ class SubgoalText:
     point_noise: int = 8
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise UserError(f"subgoal_text.kind={self.kind!r}. {did_you_mean(str(self.kind), KINDS)}")
-        if not 0 <= self.online_probability <= 1:
-            raise UserError(f"subgoal_text.online_probability={self.online_probability} must lie between 0 and 1.")
-        if self.point_noise < 0:
-            raise UserError(f"subgoal_text.point_noise={self.point_noise} must be a number of pixels, 0 for none.")
+        check_choice("subgoal_text.kind", self.kind, KINDS)
+        probability = self.online_probability
+        require(0 <= probability <= 1, f"subgoal_text.online_probability={probability} must lie between 0 and 1.")
+        require(self.point_noise >= 0, f"subgoal_text.point_noise={self.point_noise} must be 0 or more pixels.")
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:

@@ -5,7 +5,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Self
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 
 SAMPLE = "sample"
 HUB = "hf://"
@@ -28,8 +28,7 @@ class Tokenizer:
             self._processor = SentencePieceProcessor(model_proto=model)
         except (RuntimeError, TypeError) as error:
             raise UserError(f"Tokenizer {spec!r} is not a SentencePiece model file: {error}.") from None
-        if self._processor.bos_id() < 0:
-            raise UserError(f"Tokenizer {spec!r} has no beginning-of-sequence token, which every prompt starts with.")
+        require(self._processor.bos_id() >= 0, f"Tokenizer {spec!r} has no beginning-of-sequence token for prompts.")
         self._model = model
         self.spec = spec
         self.fingerprint = hashlib.sha256(model).hexdigest()[:16]
@@ -46,11 +45,11 @@ class Tokenizer:
         if spec == SAMPLE:
             return cls(files("mme_vla").joinpath("assets/tokenizer.model").read_bytes(), spec)
         path = _download(spec) if spec.startswith(HUB) else Path(spec).expanduser()
-        if not path.is_file():
-            raise UserError(
-                f"No tokenizer at {brief(spec, 300)}. Give {SAMPLE!r}, the path of a SentencePiece .model file, or "
-                f"{HUB}owner/repository/file.model (PaliGemma's: {HUB}google/paligemma-3b-pt-224/tokenizer.model)."
-            )
+        require(
+            path.is_file(),
+            f"No tokenizer at {brief(spec, 300)}. Give {SAMPLE!r}, the path of a SentencePiece .model file, or "
+            f"{HUB}owner/repository/file.model (PaliGemma's: {HUB}google/paligemma-3b-pt-224/tokenizer.model).",
+        )
         if path.stat().st_size > _LARGEST:
             raise UserError(f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most {_LARGEST:,}.")
         return cls(path.read_bytes(), spec)
@@ -67,15 +66,15 @@ class Tokenizer:
     def piece(self, text: str) -> int:
         """The id of one piece, as the model spells it (`▁` means a space)."""
         index = self._processor.piece_to_id(text)
-        if index == self._processor.unk_id():
-            raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
+        require(
+            index != self._processor.unk_id(), f"Tokenizer {self.spec!r} has no piece {text!r}, which prompts need."
+        )
         return index
 
     @property
     def end(self) -> int:
         """The id that ends a text."""
-        if self._processor.eos_id() < 0:
-            raise UserError(f"Tokenizer {self.spec!r} has no end-of-sequence token, which this policy's prompts need.")
+        require(self._processor.eos_id() >= 0, f"Tokenizer {self.spec!r} has no end-of-sequence token for prompts.")
         return self._processor.eos_id()
 
     def decode(self, ids: list[int]) -> str:
@@ -93,8 +92,7 @@ def _download(spec: str) -> Path:
 
     owner, _, remaining = spec.removeprefix(HUB).partition("/")
     name, _, filename = remaining.partition("/")
-    if not (owner and name and filename):
-        raise UserError(f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.")
+    require(owner and name and filename, f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.")
     try:
         return Path(hf_hub_download(f"{owner}/{name}", filename))
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:

@@ -14,13 +14,9 @@ if TYPE_CHECKING:
 
 # Loaded on first use: a client needs no network library of the server, and neither is needed to import the package.
 _HOME = {
-    "Client": "client",
-    "pack": "codec",
-    "unpack": "codec",
-    "PolicyServer": "server",
-    "Limits": "settings",
+    "Client": "client", "pack": "codec", "unpack": "codec", "PolicyServer": "server", "Limits": "settings",
     "ServeSettings": "settings",
-}
+}  # fmt: skip
 
 __all__ = ["Client", "Limits", "PolicyServer", "ServeSettings", "pack", "unpack"]
 

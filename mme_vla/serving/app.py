@@ -40,7 +40,6 @@ class ServedConnection:
         self._coming: asyncio.Future[Any] | None = None
 
     async def run(self) -> None:
-        """Serve until one side ends it."""
         session = Session(self._engine, self._settings)
         try:
             await self._socket.accept()
@@ -68,7 +67,6 @@ class ServedConnection:
             self._connection.expire_in(self._settings.limits.idle_s)
 
     async def _next(self) -> Any:
-        """The next message; None when the connection is to end."""
         dismissed, coming = self._connection.dismissed, self._receiving()
         if not dismissed.done():
             await asyncio.wait([coming, dismissed], return_when=asyncio.FIRST_COMPLETED)
@@ -236,7 +234,6 @@ class RequestGuard:
         self._app, self._settings, self._connections, self._stats = app, settings, connections, engine.stats
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or refuse it."""
         connection = self._connections.open.get(scope.get("client"))
         if connection is None:  # a client that has left already
             return

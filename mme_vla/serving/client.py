@@ -79,7 +79,6 @@ class Client:
         self.metadata = self._receive(self.open_timeout)
 
     def reset(self) -> dict[str, Any]:
-        """Begin a new episode on the server."""
         return self.request({"reset": True})
 
     def add_buffer(self, images: np.ndarray, states: np.ndarray, exec_start: int = 0) -> dict[str, Any]:

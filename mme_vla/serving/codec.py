@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, require
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
 MOST_OBJECTS = 2**20  # values of a message, whatever holds them; a frame with all its cameras takes about 130
@@ -23,7 +23,6 @@ except ImportError as error:  # the extra is missing: say which
 
 
 def pack(message: Any) -> bytes:
-    """Encode a message."""
     try:
         packed = msgpack.packb(message, default=_encode)
     except (TypeError, ValueError, OverflowError) as error:
@@ -36,12 +35,7 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
     """Decode a message. Arrays are read-only views on `data`: copy what is written to."""
     check_size(data)
     try:
-        return msgpack.unpackb(
-            data,
-            object_hook=_decode,
-            max_str_len=MOST_TEXT,
-            max_ext_len=0,
-        )
+        return msgpack.unpackb(data, object_hook=_decode, max_str_len=MOST_TEXT, max_ext_len=0)
     except UserError:
         raise
     except Exception as error:  # msgpack raises many kinds of exception
@@ -103,12 +97,7 @@ def _encode(value: Any) -> dict[bytes, Any]:
     if value.dtype.kind in REFUSED_KINDS:
         raise ValueError(f"arrays of dtype {value.dtype} are not sent")
     if isinstance(value, np.ndarray):
-        return {
-            b"__ndarray__": True,
-            b"data": value.tobytes(),
-            b"dtype": value.dtype.str,
-            b"shape": list(value.shape),
-        }
+        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": list(value.shape)}
     scalar = value.item()
     if not isinstance(scalar, bool | int | float | str | bytes):
         raise ValueError(f"a scalar of dtype {value.dtype} is not sent; make it a plain number")
@@ -130,11 +119,12 @@ def _decode(fields: dict[Any, Any]) -> Any:
 
 
 def _array(fields: dict[Any, Any]) -> np.ndarray:
-    dtype, shape, data = _dtype(fields), fields.get(b"shape"), fields.get(b"data")
+    dtype = _dtype(fields)
+    shape: Any = fields.get(b"shape")
+    data: Any = fields.get(b"data")
     if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
         raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
-    if not isinstance(data, bytes):
-        raise UserError(f"An array's data must be bytes, got {type(data).__name__}.")
+    require(isinstance(data, bytes), f"An array's data must be bytes, got {type(data).__name__}.")
     needed = math.prod(shape) * dtype.itemsize
     if len(data) != needed:
         raise UserError(f"An array {dtype} {shape} takes {needed} bytes, but {len(data)} were sent.")

@@ -52,7 +52,6 @@ class Connection:
         return self.in_request or (self.websocket and not self.transport.is_closing())
 
     def expire_in(self, seconds: float | None) -> None:
-        """Set the deadline; None for no deadline."""
         self.deadline = None if seconds is None else time.monotonic() + seconds
 
     def set_busy(self, busy: bool) -> None:
@@ -82,10 +81,9 @@ class Connections:
         self.stopping = False
 
     def arrive(self, transport: asyncio.Transport) -> Connection:
-        """Add a new connection."""
         unauthenticated = [known for known in self.open.values() if not (known.admitted or known.busy)]
         if len(unauthenticated) >= MAX_UNAUTHENTICATED:
-            oldest = min(unauthenticated, key=_silence)
+            oldest = min(unauthenticated, key=lambda known: known.silent_since)
             oldest.transport.abort()
             self.forget(oldest)
         address = tuple((transport.get_extra_info("peername") or (id(transport), 0))[:2])
@@ -116,7 +114,7 @@ class Connections:
             silent = [known for known in admitted if not known.busy]
             if not silent:
                 return False
-            oldest = min(silent, key=lambda known: (known.websocket, _silence(known)))
+            oldest = min(silent, key=lambda known: (known.websocket, known.silent_since))
             oldest.admitted = False
             oldest.close(1001, FULL)
             self._stats.count("let_go")
@@ -125,7 +123,6 @@ class Connections:
         return True
 
     def forget(self, connection: Connection) -> None:
-        """Remove a connection that is closed."""
         if self.open.get(connection.address) is connection:
             del self.open[connection.address]
         self._count()
@@ -137,7 +134,6 @@ class Connections:
                 connection.close(code, reason)
 
     def abort(self) -> None:
-        """Cut off what is left."""
         for connection in list(self.open.values()):
             connection.transport.abort()
 
@@ -168,10 +164,6 @@ class Connections:
 
     def _count(self) -> None:
         self._stats.connections = sum(known.admitted for known in self.open.values())
-
-
-def _silence(connection: Connection) -> float:
-    return connection.silent_since
 
 
 def timed_protocol(connections: Connections) -> type[H11Protocol]:

@@ -30,12 +30,10 @@ class ServerStats:
         self.connections = 0
 
     def took(self, kind: str, seconds: float) -> None:
-        """Note one finished piece of work."""
         self.counts[kind] += 1
         self._seconds[kind].append(seconds)
 
     def count(self, kind: str, by: int = 1) -> None:
-        """Count something that has no duration."""
         self.counts[kind] += by
 
     def percentiles(self, kind: str) -> dict[str, float] | None:
@@ -47,7 +45,6 @@ class ServerStats:
         return {"p50": round(p50 * 1e3, 2), "p95": round(p95 * 1e3, 2), "max": round(max(seconds) * 1e3, 2)}
 
     def snapshot(self) -> dict[str, Any]:
-        """Everything as plain numbers and texts."""
         batches = self.counts["batch"]
         return {
             "uptime_s": round(time.monotonic() - self._begun, 1),
@@ -58,7 +55,6 @@ class ServerStats:
         }
 
     def line(self) -> str:
-        """One line for a log."""
         infer = self.percentiles("infer")
         times = f"p50 {infer['p50']:.0f} ms, p95 {infer['p95']:.0f} ms" if infer else "none yet"
         mean = self.snapshot()["mean_batch"]
@@ -108,7 +104,6 @@ class Engine:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Begin to work, in the running event loop."""
         self._task = asyncio.get_running_loop().create_task(self._work())
 
     async def stop(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mme_vla.config.devices import find_device
 from mme_vla.embodiment.robomme import CAMERAS, check_benchmark
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.prompt import subgoal_kind
@@ -76,16 +76,16 @@ class MMEVLAModelServer(PredictModelServer):
         self.policy = checkpoint.eval()
         robot = self.policy.embodiment
         check_benchmark(robot, SPACES)
-        if robot.readings:
-            raise UserError(
-                f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it cannot be served "
-                "to it. Evaluate it with python -m mme_vla.evaluate."
-            )
-        if robot.action.of_pose:
-            raise UserError(
-                f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
-                "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
-            )
+        require(
+            not robot.readings,
+            f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it cannot be served "
+            "to it. Evaluate it with python -m mme_vla.evaluate.",
+        )
+        require(
+            not robot.action.of_pose,
+            f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
+            "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate.",
+        )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
         settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
@@ -95,7 +95,6 @@ class MMEVLAModelServer(PredictModelServer):
         )
 
     def get_observation_params(self) -> dict[str, Any]:
-        """What the benchmark is to send."""
         robot = self.policy.embodiment
         params: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
         params["send_wrist_image"] = CAMERAS[1] in robot.camera_names
@@ -119,7 +118,6 @@ class MMEVLAModelServer(PredictModelServer):
         self.sessions[ctx.session_id] = Running(self.policy.start_episode("", seed=self.seed))
 
     async def on_episode_end(self, result: dict[str, Any], ctx: SessionContext) -> None:
-        """Forget the session's episode."""
         await super().on_episode_end(result, ctx)
         self.sessions.pop(ctx.session_id, None)
 
@@ -176,8 +174,7 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
     host, port = options.host, options.port
     if options.address:
         name, _, number = options.address.rpartition(":")
-        if not number.isdecimal():
-            raise UserError(f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.")
+        require(number.isdecimal(), f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.")
         host, port = name or host, int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):

@@ -13,7 +13,8 @@ import numpy as np
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.action_space import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.utils import is_text
 
 POSE = (3, 4)
 DEEPEST = 32_767  # millimetres: the benchmark's depth is int16
@@ -52,22 +53,17 @@ def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple
     if rows is None or len(rows) != count:
         got = type(value).__name__ if rows is None else f"{len(rows)} entries"
         raise UserError(f"{key} must have one entry for each of {count} frames, got {got}.")
-    return np.stack([_reading(key, row, shape) for row in rows])
-
-
-def _reading(key: str, row: Any, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        value = np.asarray(row)
-        fits = value.dtype.kind in "fiu" and value.shape in (shape, (*shape, 1))
-    except ValueError:  # rows of different lengths
-        fits = False
-    if not fits:
-        got = f"{value.dtype} {list(value.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
-        raise UserError(f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
-    numbers = value.astype(np.float32).reshape(shape)
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{key} holds numbers that are not finite.")
-    return numbers
+    readings = []
+    for row in rows:
+        try:
+            array = np.asarray(row)
+        except ValueError:  # rows of different lengths
+            array = np.empty(0, object)
+        fits = array.dtype.kind in "fiu" and array.shape in (shape, (*shape, 1))
+        got = f"{array.dtype} {list(array.shape)}" if isinstance(row, np.ndarray) else type(row).__name__
+        require(fits, f"{key} must hold arrays {list(shape)} of numbers, got {got}.")
+        readings.append(_numbers(key, array).reshape(shape))
+    return np.stack(readings)
 
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
@@ -130,31 +126,29 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     Args:
         most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
     """
-    if not isinstance(message, dict):
-        raise UserError(f"A request is a map, got {type(message).__name__}.")
+    require(isinstance(message, dict), f"A request is a map, got {type(message).__name__}.")
     space_name = robot.action.answers
     space = message.get("action_space", space_name)
-    if space != space_name:
-        raise UserError(f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
+    require(space == space_name, f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
-    if robot.action.of_pose and "action_space" not in message:
-        raise UserError(
-            f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
-            f"send action_space={space_name!r} in the request to confirm it."
-        )
+    require(
+        not robot.action.of_pose or "action_space" in message,
+        f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
+        f"send action_space={space_name!r} in the request to confirm it.",
+    )
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames, robot)
     if any(isinstance(key, str) and key.startswith("observation/") for key in message):
         return _observation(message, robot)
     keys = [key for key in message if isinstance(key, str)][:10]
-    if keys and set(keys) <= set(KNOWN):  # flags: true was handled above
-        raise UserError(
-            f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
-            "keys observation/image, … or front_rgb_list, …"
-        )
+    require(
+        not keys or set(keys) > set(KNOWN),  # flags: true was handled above
+        f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
+        "keys observation/image, … or front_rgb_list, …",
+    )
     unknown = [key for key in keys if key not in KNOWN]
     near = did_you_mean(unknown[0], KNOWN) if unknown else f"Known: {', '.join(KNOWN)}."
     raise UserError(f"No known request has the keys {keys}. {near}")
@@ -171,11 +165,11 @@ def _flag(message: dict[Any, Any], key: str) -> bool:
 
 
 def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> AddBuffer:
-    if robot.readings:
-        raise UserError(
-            f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
-            "past frames in the challenge's lists, and the current one in either schema."
-        )
+    require(
+        not robot.readings,
+        f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
+        "past frames in the challenge's lists, and the current one in either schema.",
+    )
     images = _array(message, "images")
     if images.ndim != 5 or images.shape[1] != 1:
         raise UserError(f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype} {list(images.shape)}.")
@@ -183,13 +177,15 @@ def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) ->
     frames = _frames("images", list(images[:, 0]), most_frames)
     states = _numbers("state", _array(message, "state"))
     width = robot.state.width
-    if states.shape != (count, width):
-        raise UserError(f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}.")
+    require(
+        states.shape == (count, width), f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}."
+    )
     start = message.get("exec_start_idx", 0)
     if isinstance(start, np.integer):
         start = int(start)
-    if type(start) is not int or start < 0:
-        raise UserError(f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.")
+    require(
+        type(start) is int and start >= 0, f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}."
+    )
     return AddBuffer(frames, start, states)
 
 
@@ -209,8 +205,9 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
-    if robot.action.space is None:
-        raise UserError(f"The robot {robot.name!r} is not the benchmark's: send observation/… messages.")
+    require(
+        robot.action.space is not None, f"The robot {robot.name!r} is not the benchmark's: send observation/… messages."
+    )
     keys = {name: f"{name}_rgb_list" for name in robot.camera_names}
     views = {name: _frames(key, _get(message, key), most_frames) for name, key in keys.items()}
     sizes = (("joint_state_list", ARM_JOINTS), ("gripper_state_list", 2))
@@ -221,8 +218,7 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
         counts = ", ".join(f"{key} has {length}" for key, length in lengths.items())
         raise UserError(f"All lists need one entry a frame: {counts}.")
     first = _get(message, "is_first_step")
-    if not isinstance(first, bool | np.bool_):
-        raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
+    require(isinstance(first, bool | np.bool_), f"is_first_step must be true or false, got {type(first).__name__}.")
     goal = _text("task_goal", _get(message, "task_goal"))
     states = np.stack([benchmark_state(*proprio) for proprio in zip(joints, grippers, strict=True)])
     images = {name: view[-1] for name, view in views.items()}
@@ -257,18 +253,15 @@ def _array(message: dict[Any, Any], key: str) -> np.ndarray:
             value = np.asarray(value)
         except (ValueError, TypeError, OverflowError):
             value = None
-    if not isinstance(value, np.ndarray):
-        raise UserError(f"{key} must be an array.")
+    require(isinstance(value, np.ndarray), f"{key} must be an array.")
     return value
 
 
 def _numbers(key: str, value: np.ndarray) -> np.ndarray:
-    if value.dtype.kind not in "fiu":
-        raise UserError(f"{key} must hold numbers, got dtype {value.dtype}.")
+    require(value.dtype.kind in "fiu", f"{key} must hold numbers, got dtype {value.dtype}.")
     with np.errstate(over="ignore"):
         numbers = value.astype(np.float32)
-    if not np.isfinite(numbers).all():
-        raise UserError(f"{key} holds numbers that are not finite.")
+    require(np.isfinite(numbers).all(), f"{key} holds numbers that are not finite.")
     return numbers
 
 
@@ -276,41 +269,37 @@ def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
     rows = _get(message, key)
     if isinstance(rows, np.ndarray):
         rows = list(rows) if rows.ndim else None
-    if not isinstance(rows, list):
-        raise UserError(f"{key} must be a list of arrays [{size}].")
+    require(isinstance(rows, list), f"{key} must be a list of arrays [{size}].")
     arrays = [_numbers(key, _array({key: row}, key)) for row in rows]
     for row in arrays:
-        if row.shape != (size,):
-            raise UserError(f"{key} must hold arrays [{size}], got {list(row.shape)}.")
+        require(row.shape == (size,), f"{key} must hold arrays [{size}], got {list(row.shape)}.")
     return arrays
 
 
 def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
-    if not isinstance(frames, list):
-        raise UserError(f"{key} must be a list of uint8 images [height, width, 3].")
+    require(isinstance(frames, list), f"{key} must be a list of uint8 images [height, width, 3].")
     if not 1 <= len(frames) <= most:
         raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
-    for frame in frames:
-        _image(key, frame)
-    shapes = {frame.shape for frame in frames}
-    if len(shapes) > 1:
-        raise UserError(f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
+    shapes = {_image(key, frame).shape for frame in frames}
+    require(len(shapes) <= 1, f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
 
 
 def _image(key: str, image: Any) -> np.ndarray:
-    if not isinstance(image, np.ndarray):
-        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {type(image).__name__}.")
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[-1] != 3:
-        got = f"{image.dtype} {list(image.shape)}"
-        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {got}.")
-    if not all(SIDES[0] <= side <= SIDES[1] for side in image.shape[:2]):
-        raise UserError(f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(image.shape[:2])}.")
-    if max(image.shape[:2]) > 8 * min(image.shape[:2]):
-        raise UserError(f"{key}: an image of {list(image.shape[:2])} is too narrow to be scaled into a square.")
-    return image
+    array = isinstance(image, np.ndarray)
+    got = f"{image.dtype} {list(image.shape)}" if array else type(image).__name__
+    fits = array and image.dtype == np.uint8 and image.ndim == 3 and image.shape[-1] == 3
+    require(fits, f"{key} must be a uint8 image [height, width, 3], got {got}.")
+    low, high = sorted(image.shape[:2])
+    require(
+        low >= SIDES[0] and high <= SIDES[1],
+        f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}.",
+    )
+    require(high <= 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
+    checked: np.ndarray = image
+    return checked
 
 
 def _text(key: str, value: Any) -> str:
@@ -318,8 +307,6 @@ def _text(key: str, value: Any) -> str:
         value = value[0]  # the benchmark gives a goal as a list of wordings
     if not isinstance(value, str):
         raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
-    if len(value) > MOST_GOAL:
-        raise UserError(f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
-    if any("\ud800" <= character <= "\udfff" for character in value):
-        raise UserError(f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
+    require(len(value) <= MOST_GOAL, f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
+    require(is_text(value), f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
     return str(value)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment import Embodiment, Option
+from mme_vla.embodiment import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import missing_extra
 from mme_vla.policy.base import Policy
@@ -22,22 +22,18 @@ from mme_vla.serving.settings import ServeSettings, listen
 def warm_up(policy: Policy, settings: ServeSettings) -> None:
     """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
     robot, count = policy.embodiment, settings.encode_chunk
+    # Black images of every camera, and a wall at no distance where it reads depth.
+    frames: dict[str, np.ndarray] = {}
+    beside = (np.zeros((count, SIDE, SIDE, 1), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)))
+    for camera in robot.cameras:
+        frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
+        frames |= dict(zip(camera.readings, beside, strict=False))
     episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
     for episode in episodes:
         episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
-        episode.observe(_nothing(robot, count), np.zeros((count, robot.state.width), np.float32))
+        episode.observe(frames, np.zeros((count, robot.state.width), np.float32))
     policy.act(episodes[:1], settings.flow_steps)
     policy.act(episodes, settings.flow_steps)
-
-
-def _nothing(robot: Embodiment, count: int) -> dict[str, np.ndarray]:
-    """Black images of every camera, and a wall at no distance where it reads depth."""
-    frames: dict[str, np.ndarray] = {}
-    for camera in robot.cameras:
-        frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
-        beside = (np.zeros((count, SIDE, SIDE, 1), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)))
-        frames |= dict(zip(camera.readings, beside, strict=False))
-    return frames
 
 
 try:
@@ -79,7 +75,6 @@ class PolicyServer:
         self._uvicorn: uvicorn.Server | None = None
 
     async def start(self) -> None:
-        """Warm up, then accept clients."""
         begun = time.perf_counter()
         await self.engine.call(lambda: warm_up(self.engine.policy, self.settings))
         logger.info("warmed up in %.1f s", time.perf_counter() - begun)
@@ -144,7 +139,6 @@ class PolicyServer:
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
-    """The first message to a client."""
     limits = settings.limits
     return {
         "server": "mme_vla",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.robomme import benchmark_action
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import unpack
 from mme_vla.serving.engine import Engine
@@ -82,6 +82,7 @@ class Session:
 
     async def _infer(self, request: Infer) -> np.ndarray:
         policy = self._engine.policy
+        reads_actions = policy.require_processor().prompt_spec.past_actions > 0
         if request.first:
             self._begin()  # a client that repeats its first request means the same episode, not a longer one
         elif request.first is not None and self.episode.n_observed_frames == 0:
@@ -97,7 +98,7 @@ class Session:
             self._check_capacity(len(request.frames))
             if request.first:
                 self._exec_start = len(request.frames) - 1
-        elif self._reads_past_actions and self._n_frames_at_action == self.episode.n_observed_frames:
+        elif reads_actions and self._n_frames_at_action == self.episode.n_observed_frames:
             raise UserError(
                 "This policy reads which actions were executed, one a frame: send the frames since the last chunk with "
                 "add_buffer before the observation."
@@ -154,15 +155,11 @@ class Session:
 
     def _check_capacity(self, count: int) -> None:
         total, most = self.episode.n_observed_frames + count, self._settings.limits.frames
-        if total > most:
-            raise UserError(
-                f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
-                "episodes."
-            )
-
-    @property
-    def _reads_past_actions(self) -> bool:
-        return self._engine.policy.require_processor().prompt_spec.past_actions > 0
+        require(
+            total <= most,
+            f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
+            "episodes.",
+        )
 
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""
@@ -202,13 +199,7 @@ class HttpSessions:
         self.entries: dict[Name, SessionEntry] = {}
 
     async def respond(self, name: Name, request: Request, begun: float) -> dict[str, Any]:
-        """Answer a request of a session, after those of the same session that came before.
-
-        Raises:
-            NoEpisodeError: the request continues with an episode that is not here.
-            BusyError: a new session, and no place for it.
-            UserError: the request does not fit the episode, which ends with it, as it does with any other error.
-        """
+        """Answer a request of a session, after those of the same session that came before."""
         entry = self.find(name, request)
         entry.requests += 1
         try:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from mme_vla.config.sections import Positive, PositiveInt, Range, read_section
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 
 def is_local(host: str) -> bool:
@@ -20,9 +20,7 @@ def is_local(host: str) -> bool:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket bound to this address."""
-    if not 0 <= port < 2**16:
-        raise UserError(f"port={port!r} is no port; choose 0 (any free one) to 65535.")
+    require(0 <= port < 2**16, f"port={port!r} is no port; choose 0 (any free one) to 65535.")
     bound = None
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -76,11 +74,11 @@ class ServeSettings:
         key = self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and key.strip() == key != ""):
             raise UserError("api_key must be plain ASCII text without blanks around it; null for no key.")
-        if self.require_key and key is None:
-            raise UserError(
-                "require_key=true, and there is no api_key: set the environment variable MME_VLA_API_KEY, or "
-                "require_key=false to serve every client that reaches the port."
-            )
+        require(
+            not self.require_key or key is not None,
+            "require_key=true, and there is no api_key: set the environment variable MME_VLA_API_KEY, or "
+            "require_key=false to serve every client that reaches the port.",
+        )
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> Self:
@@ -94,16 +92,16 @@ class ServeSettings:
 
     def check_robot(self, robot: Embodiment, past_actions: int = 0) -> None:
         """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this."""
-        if past_actions and robot.action.frames is None:
-            raise UserError(
-                f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
-                f"many motions of {robot.name!r} they took: it cannot be served."
-            )
-        if self.action_space not in (None, robot.action.answers):
-            raise UserError(
-                f"action_space={self.action_space}: this policy returns {robot.action.answers}, "
-                f"{robot.action.width} numbers an action, and nothing is converted. The client has to convert."
-            )
+        require(
+            not past_actions or robot.action.frames is not None,
+            f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
+            f"many motions of {robot.name!r} they took: it cannot be served.",
+        )
+        require(
+            self.action_space in (None, robot.action.answers),
+            f"action_space={self.action_space}: this policy returns {robot.action.answers}, "
+            f"{robot.action.width} numbers an action, and nothing is converted. The client has to convert.",
+        )
 
     @property
     def local_only(self) -> bool:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from mme_vla.subgoal.text import Parsed, Point
+from mme_vla.subgoal.text import Point
 
 HOLD = {"ButtonUnmask": 90, "PickHighlight": 90}
 _HOLD_BY_SUBGOAL = {"ButtonUnmaskSwap": {"press the first button": 100, "press the second button": 250}}
@@ -26,10 +26,6 @@ class SubgoalHistory:
         self.entries.append(entry)
         self.points.extend(points)
         return True
-
-    def add_parsed(self, parsed: Parsed) -> bool:
-        """Note a parsed answer."""
-        return self.add(parsed.entry, parsed.points)
 
 
 def hold_until(task: str, last: str | None) -> int:

@@ -23,12 +23,10 @@ class BackgroundEpisode(SubgoalEpisode):
         self._news: list[Callable[[], None]] = []
 
     def skip(self, count: int) -> None:
-        """Let frames pass, see `SubgoalEpisode`."""
         super().skip(count)
         self._news.append(lambda: self.inner.skip(count))
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take frames, see `SubgoalEpisode`."""
         super().observe(frames, info)
         self._news.append(lambda: self.inner.observe(frames, info))
 
@@ -59,7 +57,6 @@ class BackgroundPredictor(SubgoalPredictor):
         self._prediction: Future[list[Subgoal]] | None = None
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> BackgroundEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
         return BackgroundEpisode(self.inner.start_episode(goal, video, task))
 
     def predict(self, episodes: Sequence[Any]) -> list[Subgoal]:

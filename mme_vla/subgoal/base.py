@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.text import KINDS, MalformedReply, Parsed, Point
 
@@ -58,7 +58,6 @@ class Usage:
     problems: Counter[str] = field(default_factory=Counter)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for logs."""
         return {**asdict(self), "problems": dict(self.problems)}
 
 
@@ -108,7 +107,6 @@ class SubgoalEpisode:
 
     @property
     def frame(self) -> np.ndarray:
-        """The current front image."""
         if self._frame is None:
             raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
         return self._frame
@@ -129,12 +127,11 @@ class SubgoalPredictor:
     """Whether `start_episode` has to be given the images of a conditioning video."""
     sees_passing = True
     """Whether frames are looked at besides those at which `predict` is called."""
+    episode_type: type[SubgoalEpisode] = SubgoalEpisode
 
     def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
-        if kind not in KINDS:
-            raise UserError(f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
-        if interval < 1:
-            raise UserError(f"subgoal.interval={interval} must be a positive number of steps.")
+        require(kind in KINDS, f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
+        require(interval >= 1, f"subgoal.interval={interval} must be a positive number of steps.")
         self.kind, self.interval = kind, interval
         self.usage = Usage()
         self.settings: dict[str, Any] = {}
@@ -146,7 +143,7 @@ class SubgoalPredictor:
             goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first execution frame.
             task: its name (`ButtonUnmask`), for rules that hold for some tasks.
         """
-        return SubgoalEpisode(goal, video, task)
+        return self.episode_type(goal, video, task)
 
     def predict(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
         """The subgoals of these episodes at their current frames; those that are due are asked in one batch.
@@ -172,7 +169,6 @@ class SubgoalPredictor:
         raise NotImplementedError
 
     def accepted(self, parsed: Parsed, reply: str) -> Subgoal:
-        """A subgoal that a model gave."""
         return Subgoal(parsed.text, parsed.points, queried=True, reply=reply)
 
     def unchanged(self, episode: SubgoalEpisode, problem: str, reply: str = "", reason: str = "") -> Subgoal:

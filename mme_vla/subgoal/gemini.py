@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.processing.prompt import POINT
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
@@ -19,65 +19,30 @@ AT = " at <y, x>"
 # `@` marks where a grounded subgoal has a point. [ordinal]: first, second, …; [colour]: red, blue or green.
 VOCABULARY: dict[str, tuple[str, ...]] = {
     "BinFill": ("pick up the [ordinal] [colour] cube@", "put it into the bin@", "press the button@"),
-    "PickXtimes": (
-        "pick up the [colour] cube@ for the [ordinal] time",
-        "place the [colour] cube onto the target@",
-        "press the button to stop@",
-    ),
-    "SwingXtimes": (
-        "pick up the [colour] cube@",
-        "move to the top of the right-side target@ for the [ordinal] time",
-        "move to the top of the left-side target@ for the [ordinal] time",
-        "put the [colour] cube on the table",
-        "press the button@",
-    ),
-    "StopCube": (
-        "move to the top of the button@ to prepare",
-        "remain static",
-        "press the button to stop the cube on the target@",
-    ),
-    "ButtonUnmask": (
-        "press the button@",
-        "pick up the container@ that hides the [colour] cube",
-        "put down the container",
-    ),
-    "ButtonUnmaskSwap": (
-        "press the first button@",
-        "press the second button@",
-        "pick up the container@ that hides the [colour] cube",
-        "put down the container",
-    ),
+    "PickXtimes": ("pick up the [colour] cube@ for the [ordinal] time", "place the [colour] cube onto the target@",
+                   "press the button to stop@"),
+    "SwingXtimes": ("pick up the [colour] cube@", "move to the top of the right-side target@ for the [ordinal] time",
+                    "move to the top of the left-side target@ for the [ordinal] time",
+                    "put the [colour] cube on the table", "press the button@"),
+    "StopCube": ("move to the top of the button@ to prepare", "remain static",
+                 "press the button to stop the cube on the target@"),
+    "ButtonUnmask": ("press the button@", "pick up the container@ that hides the [colour] cube",
+                     "put down the container"),
+    "ButtonUnmaskSwap": ("press the first button@", "press the second button@",
+                         "pick up the container@ that hides the [colour] cube", "put down the container"),
     "VideoUnmask": ("pick up the container@ that hides the [colour] cube", "put down the container"),
     "VideoUnmaskSwap": ("pick up the container@ that hides the [colour] cube", "put down the container"),
-    "PickHighlight": (
-        "press the button@",
-        "pick up the [ordinal] highlighted cube@, which is [colour]",
-        "place the cube onto the table",
-    ),
-    "VideoRepick": (
-        "pick up the correct cube@ for the [ordinal] time",
-        "put it down",
-        "press the button@ to finish",
-    ),
+    "PickHighlight": ("press the button@", "pick up the [ordinal] highlighted cube@, which is [colour]",
+                      "place the cube onto the table"),
+    "VideoRepick": ("pick up the correct cube@ for the [ordinal] time", "put it down", "press the button@ to finish"),
     "VideoPlaceButton": ("pick up the cube@", "place the cube onto the correct target@"),
     "VideoPlaceOrder": ("pick up the cube@", "place the cube onto the correct target@"),
-    "MoveCube": (
-        "close gripper and push the cube@ to the target@",
-        "pick up the cube@",
-        "place the cube onto the target@",
-        "pick up the peg@",
-        "hook the cube@ to the target@ with the peg",
-    ),
-    "InsertPeg": (
-        "pick up the peg by grasping the near end@",
-        "pick up the peg by grasping the far end@",
-        "insert the peg from the left side of the box@",
-        "insert the peg from the right side of the box@",
-    ),
-    "PatternLock": (
-        "move forward", "move backward", "move left", "move right",
-        "move forward-left", "move forward-right", "move backward-left", "move backward-right",
-    ),
+    "MoveCube": ("close gripper and push the cube@ to the target@", "pick up the cube@",
+                 "place the cube onto the target@", "pick up the peg@", "hook the cube@ to the target@ with the peg"),
+    "InsertPeg": ("pick up the peg by grasping the near end@", "pick up the peg by grasping the far end@",
+                  "insert the peg from the left side of the box@", "insert the peg from the right side of the box@"),
+    "PatternLock": ("move forward", "move backward", "move left", "move right", "move forward-left",
+                    "move forward-right", "move backward-left", "move backward-right"),
     "RouteStick": tuple(
         f"move to the nearest {side} target by circling around the stick {direction}"
         for side in ("left", "right") for direction in ("clockwise", "counterclockwise")
@@ -139,7 +104,7 @@ def what_there_is(task: str, kind: str) -> list[str]:
     templates = _subgoals(task, kind)
     parts = [
         "Subgoals of this task, to be used word for word ([ordinal] is first, second, third, …; [colour] is red, blue "
-        "or green):\n" + "\n".join(f"- {text}" for text in templates),
+        "or green):\n" + "\n".join(f"- {text}" for text in templates)
     ]
     if kind == "grounded" and any(AT in text for text in templates):
         parts.append(
@@ -153,12 +118,15 @@ def what_there_is(task: str, kind: str) -> list[str]:
 
 def example_of(task: str, kind: str) -> str:
     """One subgoal of a task, as a model is to write it."""
-    return _example(_subgoals(task, kind)[0])
+    text = _subgoals(task, kind)[0]
+    filled = text.replace("[ordinal]", "first").replace("[colour]", "red").replace("<y, x>", "<512, 430>")
+    assert POINT.search(filled) or "<" not in filled
+    return filled
 
 
 def _subgoals(task: str, kind: str) -> list[str]:
     templates = VOCABULARY.get(task) or tuple(dict.fromkeys(t for one in VOCABULARY.values() for t in one))
-    return [_filled(template, kind) for template in templates]
+    return [template.replace("@", AT if kind == "grounded" else "") for template in templates]
 
 
 def first_query(goal: str, video: bool) -> str:
@@ -175,16 +143,6 @@ def next_query(clip: bool) -> str:
     """A later question; its video, or the single image of a very short stretch, comes before it."""
     context = "This video shows what the robot did since." if clip else "This image shows the scene now."
     return f"{context} Describe what happened, and name the current subgoal."
-
-
-def _filled(template: str, kind: str) -> str:
-    return template.replace("@", AT if kind == "grounded" else "")
-
-
-def _example(text: str) -> str:
-    filled = text.replace("[ordinal]", "first").replace("[colour]", "red").replace("<y, x>", "<512, 430>")
-    assert POINT.search(filled) or "<" not in filled
-    return filled
 
 
 CLIP = 4  # frames: fewer are not worth a video
@@ -204,12 +162,10 @@ class GeminiEpisode(SubgoalEpisode):
         self.again = False
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take frames, see `SubgoalEpisode`; they wait for the next question."""
         super().observe(frames, info)
         self.unseen += list(frames)
 
     def next_message(self) -> list[Any]:
-        """The parts of the next question."""
         if self.messages:
             return self._since(self.unseen)
         video = [MediaPart(self.video)] if len(self.video) else []
@@ -222,8 +178,33 @@ class GeminiEpisode(SubgoalEpisode):
         return [MediaPart(np.stack(frames) if clip else self.frame), next_query(clip)]
 
 
+class PromptedPredictor(SubgoalPredictor):
+    """What predictors with a model behind an API share; a subclass has `_ask`, which returns an episode's subgoal.
+
+    Args:
+        interval: steps between two questions. workers: questions under way at once.
+        api: how the model is spoken to, a key of `mme_vla.subgoal.models.api.CONNECTIONS`.
+        client: what the questions go to; None makes one. settings: of that API, checked here.
+    """
+
+    def __init__(
+        self, kind: str, interval: int, workers: int, api: str, client: Any, settings: Mapping[str, Any]
+    ) -> None:
+        super().__init__(kind, interval)
+        require(workers >= 1, f"workers={workers} must be at least 1: questions under way at once.")
+        self.workers = workers
+        self.api = make_api(api, settings, "subgoal", self.usage, client)
+        self._lock = threading.Lock()
+
+    def predict_due(self, episodes: Sequence[Any]) -> list[Subgoal]:
+        return side_by_side(self._ask, episodes, self.workers)
+
+    def _ask(self, episode: Any) -> Subgoal:
+        raise NotImplementedError
+
+
 @SUBGOALS.register("gemini")
-class Gemini(SubgoalPredictor):
+class Gemini(PromptedPredictor):
     """Asks at the first step and then at multiples of `interval`, showing all frames since the last question.
 
     Nothing that goes wrong on the way ends an episode: it keeps its last subgoal, the problem is counted, and the
@@ -238,6 +219,7 @@ class Gemini(SubgoalPredictor):
     """
 
     provider = "gemini"
+    episode_type = GeminiEpisode
 
     def __init__(
         self,
@@ -248,18 +230,9 @@ class Gemini(SubgoalPredictor):
         client: Any = None,
         **settings: Any,
     ) -> None:
-        super().__init__(kind, interval)
-        if workers < 1:
-            raise UserError(f"workers={workers} must be at least 1: questions under way at once.")
-        if wait < 0:
-            raise UserError(f"wait={wait} must be a number of steps, 0 or more.")
-        self.wait, self.workers = wait, workers
-        self.api = make_api(self.provider, settings, "subgoal", self.usage, client)
-        self._lock = threading.Lock()
-
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> GeminiEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
-        return GeminiEpisode(goal, video, task)
+        super().__init__(kind, interval, workers, self.provider, client, settings)
+        require(wait >= 0, f"wait={wait} must be a number of steps, 0 or more.")
+        self.wait = wait
 
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether to ask now; a question that failed is repeated at the next opportunity."""
@@ -267,10 +240,6 @@ class Gemini(SubgoalPredictor):
         if episode.again or episode.query_step is None:
             return True
         return super().due(episode) and not (episode.task in LATE and self.due_step(episode) < self.wait)
-
-    def predict_due(self, episodes: Sequence[GeminiEpisode]) -> list[Subgoal]:
-        """Ask for all of them, some at a time."""
-        return side_by_side(self._ask, episodes, self.workers)
 
     def _ask(self, episode: GeminiEpisode) -> Subgoal:
         message = ("user", episode.next_message())

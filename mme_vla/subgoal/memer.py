@@ -28,7 +28,6 @@ class MemerEpisode(SubgoalEpisode):
         self._reach = reach
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take frames, see `SubgoalEpisode`; only the last ones are kept."""
         first = self.n_observed_frames
         super().observe(frames, info)
         self._recent |= {first + i: frame for i, frame in enumerate(frames)}
@@ -40,7 +39,6 @@ class MemerEpisode(SubgoalEpisode):
         return {t: self._recent[t] for t in indices}
 
     def add_keyframes(self, frames: Mapping[int, np.ndarray], distance: int) -> None:
-        """Add keyframes and thin them out."""
         known = self.keyframes | dict(frames)
         self.keyframes = {t: known[t] for t in merge_keyframes(list(known), distance)}
 
@@ -69,11 +67,9 @@ class Memer(VLMPredictor):
         self.recent, self.stride, self.merge_distance = recent, stride, merge_distance
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> MemerEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
         return MemerEpisode(goal, video, task, (self.recent - 1) * self.stride + 1)
 
     def question(self, episode: MemerEpisode) -> Question:
-        """What is asked at the current frame."""
         recent = episode.recent(self.recent, self.stride)
         video = len(episode.video) > 0
         user = memer_user(episode.goal, len(episode.keyframes), len(recent), video)
@@ -81,7 +77,6 @@ class Memer(VLMPredictor):
         return Question(memer_system(), user, images, [Clip.of(episode.video)] if video else [])
 
     def predict_due(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
-        """Ask for all of them in one batch."""
         _ = [episode.frame for episode in episodes]  # every episode has seen something
         completions = self.ask([self.question(episode) for episode in episodes])
         return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]

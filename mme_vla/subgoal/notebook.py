@@ -1,17 +1,16 @@
 """`notebook`: a prompted model that watches for completion, and takes typed notes only when it has seen it."""
 
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, require
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.gemini import example_of, what_there_is
-from mme_vla.subgoal.models.api import ApiFailure, make_api, side_by_side
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
+from mme_vla.subgoal.gemini import PromptedPredictor, example_of, what_there_is
+from mme_vla.subgoal.models.api import ApiFailure
 from mme_vla.subgoal.models.connection import MediaPart
 from mme_vla.subgoal.text import MalformedReply, json_object, parse_gemini, pixels_of_pairs, says_done
 from mme_vla.utils import is_text
@@ -90,12 +89,7 @@ class Count:
 
     value: int
 
-    def to_dict(self) -> dict[str, Any]:
-        """As a model writes it, without the name."""
-        return {"kind": "count", "value": self.value}
-
     def check(self, before: "Count | None", finished: bool) -> None:
-        """See `Notebook.written`."""
         if before is not None and not before.value <= self.value <= before.value + finished:
             raise MalformedReply(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
 
@@ -105,10 +99,6 @@ class Identity:
     """Which thing is meant, in words that tell it from the others."""
 
     words: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """As a model writes it, without the name."""
-        return {"kind": "identity", "words": self.words}
 
     def check(self, before: "Identity | None", finished: bool) -> None:
         """See `Notebook.written`: things are moved, so that other words may tell them."""
@@ -121,16 +111,9 @@ class Route:
     steps: tuple[str, ...]
     done: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
-        """As a model writes it, without the name."""
-        return {"kind": "route", "steps": list(self.steps), "done": self.done}
-
     def check(self, before: "Route | None", finished: bool) -> None:
-        """See `Notebook.written`."""
-        if self.done > len(self.steps):
-            raise MalformedReply(f"{self.done} of {len(self.steps)} steps cannot be done")
-        if before is not None and before.steps != self.steps:
-            raise MalformedReply("the steps of a route were changed")
+        require(self.done <= len(self.steps), f"{self.done} of {len(self.steps)} steps cannot be done", MalformedReply)
+        require(before is None or before.steps == self.steps, "the steps of a route were changed", MalformedReply)
         if before is not None and not before.done <= self.done <= before.done + finished:
             raise MalformedReply(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
 
@@ -150,9 +133,6 @@ class Notebook:
 
         Args:
             finished: the subgoal that was just completed; None where notes are taken before anything was done.
-
-        Raises:
-            MalformedAnswer: an entry changes in a way that its kind does not; nothing is written then.
         """
         notes = dict(self.notes)
         for name, note in entries:
@@ -161,8 +141,7 @@ class Notebook:
                 raise MalformedReply(f"{brief(name)} was another kind of note before")
             note.check(before, finished is not None)  # type: ignore[arg-type]
             notes[name] = note
-        if len(notes) > MOST_NOTES:
-            raise MalformedReply(f"the notebook takes {MOST_NOTES} notes")
+        require(len(notes) <= MOST_NOTES, f"the notebook takes {MOST_NOTES} notes", MalformedReply)
         return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
 
     def in_words(self) -> str:
@@ -181,11 +160,7 @@ class Notebook:
 
 
 def read_notes(entries: Any) -> list[tuple[str, Note]]:
-    """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has.
-
-    Raises:
-        MalformedAnswer: something else.
-    """
+    """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has."""
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise MalformedReply("notes is not a list of objects")
     return [(_words(entry.get("name"), "name"), _read(entry)) for entry in entries[: MOST_NOTES + 1]]
@@ -198,9 +173,12 @@ def _read(entry: dict[str, Any]) -> Note:
     if kind == "identity":
         return Identity(_words(entry.get("words"), "words"))
     if kind == "route":
-        steps = entry.get("steps")
-        if not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS:
-            raise MalformedReply(f"steps is not a list of 1 to {MOST_STEPS} texts")
+        steps: Any = entry.get("steps")
+        require(
+            isinstance(steps, list) and 1 <= len(steps) <= MOST_STEPS,
+            f"steps is not a list of 1 to {MOST_STEPS} texts",
+            MalformedReply,
+        )
         return Route(tuple(_words(step, "steps") for step in steps), _integer(entry.get("done", 0), "done", MOST_STEPS))
     raise MalformedReply(f"there are notes of the kinds count, identity and route, not {brief(kind)}")
 
@@ -208,8 +186,7 @@ def _read(entry: dict[str, Any]) -> Note:
 def _words(value: Any, what: str) -> str:
     if not isinstance(value, str) or not is_text(value) or not (text := " ".join(value.split())):
         raise MalformedReply(f"the {what} of a note is no text")
-    if len(text) > MOST_WORDS:
-        raise MalformedReply(f"the {what} of a note has more than {MOST_WORDS} characters")
+    require(len(text) <= MOST_WORDS, f"the {what} of a note has more than {MOST_WORDS} characters", MalformedReply)
     return text
 
 
@@ -236,7 +213,6 @@ class NotebookEpisode(SubgoalEpisode):
         self.agreed = False
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
-        """Take frames, see `SubgoalEpisode`."""
         super().observe(frames, info)
         self.since = [*self.since, *frames][-LONGEST:]
 
@@ -247,7 +223,7 @@ class NotebookEpisode(SubgoalEpisode):
 
 
 @SUBGOALS.register("notebook")
-class NotebookPredictor(SubgoalPredictor):
+class NotebookPredictor(PromptedPredictor):
     """Asks whether the subgoal is complete; only then brings the notebook up to date and names the next one.
 
     The notebook is what a question tells of the past, beside the frames of the current subgoal: no conversation grows.
@@ -255,11 +231,9 @@ class NotebookPredictor(SubgoalPredictor):
 
     Args:
         interval: steps between two questions to the monitor.
-        workers: questions under way at once.
-        api: how the model is spoken to (`mme_vla.subgoal.models.api.CONNECTIONS`).
-        client: what the questions go to; None makes one.
-        settings: keys of the api's settings.
     """
+
+    episode_type = NotebookEpisode
 
     def __init__(
         self,
@@ -270,20 +244,7 @@ class NotebookPredictor(SubgoalPredictor):
         client: Any = None,
         **settings: Any,
     ) -> None:
-        super().__init__(kind, interval)
-        if workers < 1:
-            raise UserError(f"workers={workers} must be at least 1: questions under way at once.")
-        self.workers = workers
-        self.api = make_api(api, settings, "subgoal", self.usage, client)
-        self._lock = threading.Lock()
-
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> NotebookEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
-        return NotebookEpisode(goal, video, task)
-
-    def predict_due(self, episodes: Sequence[NotebookEpisode]) -> list[Subgoal]:
-        """Ask for all of them, some at a time."""
-        return side_by_side(self._ask, episodes, self.workers)
+        super().__init__(kind, interval, workers, api, client, settings)
 
     def _ask(self, episode: NotebookEpisode) -> Subgoal:
         replies: list[str] = []
@@ -304,9 +265,8 @@ class NotebookPredictor(SubgoalPredictor):
             images = episode.images()
             query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
             replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
-            done = json_object(replies[-1]).get("done")
-            if not isinstance(done, bool):
-                raise MalformedReply("the monitor's answer does not say whether it is done")
+            done: Any = json_object(replies[-1]).get("done")
+            require(isinstance(done, bool), "the monitor's answer does not say whether it is done", MalformedReply)
             episode.agreed = done
         return episode.agreed
 

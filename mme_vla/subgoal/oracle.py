@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.text import points_of
@@ -20,15 +20,14 @@ class Oracle(SubgoalPredictor):
     sees_video = sees_passing = False
 
     def predict_due(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
-        """Look the texts up."""
         return [self._read(episode) for episode in episodes]
 
     def _read(self, episode: SubgoalEpisode) -> Subgoal:
-        if not isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str):
-            raise UserError(
-                f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…, info); it reports "
-                f"{sorted(map(str, episode.info)) or 'nothing'}."
-            )
+        require(
+            isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str),
+            f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…, info); it reports "
+            f"{sorted(map(str, episode.info)) or 'nothing'}.",
+        )
         text = online_subgoal(episode.info, self.kind)
         if text is None:
             return Subgoal(episode.subgoal.text, episode.subgoal.points)

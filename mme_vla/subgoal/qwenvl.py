@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
@@ -37,13 +37,11 @@ class VLMPredictor(SubgoalPredictor):
         vlm: VLM | None = None,
     ) -> None:
         super().__init__(kind, interval)
-        if max_new_tokens < 1:
-            raise UserError(f"max_new_tokens={max_new_tokens} must be at least 1.")
+        require(max_new_tokens >= 1, f"max_new_tokens={max_new_tokens} must be at least 1.")
         self.max_new_tokens = max_new_tokens
         self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=batch_size)
 
     def ask(self, questions: Sequence[Question]) -> list[Completion]:
-        """Answer and keep count."""
         started = time.perf_counter()
         completions = self.vlm.generate(questions, self.max_new_tokens)
         self.usage.seconds += time.perf_counter() - started
@@ -70,14 +68,11 @@ class QwenVL(VLMPredictor):
     """
 
     sees_passing = False
+    episode_type = QwenEpisode
 
     def __init__(self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any) -> None:
         super().__init__(kind, interval, **options)
         self.hold = hold
-
-    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> QwenEpisode:
-        """Begin an episode, see `SubgoalPredictor`."""
-        return QwenEpisode(goal, video, task)
 
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held is left out."""
@@ -86,7 +81,6 @@ class QwenVL(VLMPredictor):
         return super().due(episode) and not on_hold
 
     def question(self, episode: QwenEpisode) -> Question:
-        """What is asked at the current frame."""
         video = len(episode.video) > 0
         user = subgoal_user(self.kind, episode.goal, episode.history.entries, video)
         return Question(
@@ -97,7 +91,6 @@ class QwenVL(VLMPredictor):
         )
 
     def predict_due(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
-        """Ask for all of them in one batch."""
         completions = self.ask([self.question(episode) for episode in episodes])
         return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
 
@@ -107,5 +100,5 @@ class QwenVL(VLMPredictor):
         except MalformedReply as error:
             problem, reason = problem_of(reply, error)
             return self.unchanged(episode, problem, reply, reason)
-        episode.history.add_parsed(parsed)
+        episode.history.add(parsed.entry, parsed.points)
         return self.accepted(parsed, reply)

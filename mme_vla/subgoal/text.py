@@ -1,16 +1,17 @@
 """From a language model's answer to a subgoal: points, JSON, coordinates.
 
 Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000; the policy reads pixels of
-the 256×256 front image, `<row, column>`. What cannot be read raises `MalformedAnswer`, which the predictors count
+the 256×256 front image, `<row, column>`. What cannot be read raises `MalformedReply`, which the predictors count
 and survive.
 """
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.utils import is_text, parse_json
 
 IMAGE, VIDEO, BBOX = "<image>", "<video>", "<bbox>"
@@ -59,7 +60,6 @@ def numbered(history: Sequence[str]) -> str:
 
 
 def memer_system() -> str:
-    """The system prompt of MemER."""
     return _MEMER_SYSTEM
 
 
@@ -151,19 +151,18 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
 
 
 def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
-    """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points.
-
-    Raises:
-        MalformedAnswer: nothing in it, a damaged point, or one outside the image.
-    """
+    """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points."""
     text = " ".join(reply.split())
-    if not text:
-        raise MalformedReply("the answer is empty")
+    require(text, "the answer is empty", MalformedReply)
     pixels = [(int(y), int(x)) for y, x in _BOX.findall(text)]
-    if any(value > THOUSAND for point in pixels for value in point):
-        raise MalformedReply("a point lies outside 0…1000")
-    if _BOX_MARK.search(_BOX.sub("", text)):
-        raise MalformedReply("a point is not of the form <|box_start|>(a,b)<|box_end|>")
+    require(
+        not any(value > THOUSAND for point in pixels for value in point), "a point lies outside 0…1000", MalformedReply
+    )
+    require(
+        not _BOX_MARK.search(_BOX.sub("", text)),
+        "a point is not of the form <|box_start|>(a,b)<|box_end|>",
+        MalformedReply,
+    )
     points = tuple((to_pixels(y, side), to_pixels(x, side)) for y, x in pixels)
     values = iter(points)
     display_text = _BOX.sub(lambda _: "<{}, {}>".format(*next(values)), text)
@@ -179,16 +178,16 @@ def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list
 
     Returns:
         The subgoal and the positions, from 1, in ascending order.
-
-    Raises:
-        MalformedAnswer: no JSON object, no subtask, or positions that are no list of whole numbers.
     """
     fields = json_object(reply)
-    subtask, positions = fields.get("current_subtask"), fields.get("keyframe_positions", [])
-    if not isinstance(subtask, str):
-        raise MalformedReply("the answer has no current_subtask")
-    if not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions):
-        raise MalformedReply("keyframe_positions is not a list of whole numbers")
+    subtask: Any = fields.get("current_subtask")
+    positions: Any = fields.get("keyframe_positions", [])
+    require(isinstance(subtask, str), "the answer has no current_subtask", MalformedReply)
+    require(
+        isinstance(positions, list) and not any(isinstance(p, bool) or not isinstance(p, int) for p in positions),
+        "keyframe_positions is not a list of whole numbers",
+        MalformedReply,
+    )
     return parse_subgoal(_writable(subtask), side), sorted({p for p in positions if 1 <= p <= recent})
 
 
@@ -196,26 +195,18 @@ def parse_gemini(reply: str) -> str:
     """Return the subgoal of a prompted model's reply, points still in thousandths.
 
     The first quoted string after a `"subgoal"` key on that line counts; failing that, the answer read as JSON.
-
-    Raises:
-        MalformedAnswer: there is none.
     """
     for remainder in _SUBGOAL_KEY.findall(reply):
         quoted = _QUOTED.search(remainder)
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
-    text = json_object(reply).get("subgoal")
-    if not isinstance(text, str) or not text.strip():
-        raise MalformedReply("the answer names no subgoal")
+    text: Any = json_object(reply).get("subgoal")
+    require(isinstance(text, str) and text.strip(), "the answer names no subgoal", MalformedReply)
     return _writable(text.strip())
 
 
 def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
-    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side].
-
-    Raises:
-        MalformedAnswer: a number is too long to be read.
-    """
+    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side]."""
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
@@ -241,21 +232,15 @@ def mark_points(text: str) -> tuple[str, list[Point]]:
 
 
 def points_of(text: str) -> tuple[Point, ...]:
-    """The points `at <y, x>` of a text."""
     return tuple((int(y), int(x)) for y, x in _PIXELS.findall(text))
 
 
-def json_object(reply: str) -> dict[str, object]:
-    """The outermost braces of an answer as JSON.
-
-    Raises:
-        MalformedAnswer: there are none, or something else between them.
-    """
+def json_object(reply: str) -> dict[str, Any]:
+    """The outermost braces of an answer as JSON."""
     start, stop = reply.find("{"), reply.rfind("}")
-    if start < 0 or stop < start:
-        raise MalformedReply("the answer holds no JSON object")
+    require(start >= 0 and stop >= start, "the answer holds no JSON object", MalformedReply)
     try:
-        fields: dict[str, object] = parse_json(reply[start : stop + 1], "the answer", finite=False)
+        fields: dict[str, Any] = parse_json(reply[start : stop + 1], "the answer", finite=False)
     except UserError as error:
         raise MalformedReply(f"the answer is not JSON: {error}") from None
     return fields
@@ -263,6 +248,5 @@ def json_object(reply: str) -> dict[str, object]:
 
 def _writable(text: str) -> str:
     """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
-    if not is_text(text):
-        raise MalformedReply("the answer holds half a character")
+    require(is_text(text), "the answer holds half a character", MalformedReply)
     return text

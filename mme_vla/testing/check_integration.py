@@ -22,10 +22,6 @@ def check_integration(name: str, memory: str = "framesamp", backbone: str = "tin
     Args:
         name: the key in `INTEGRATIONS`. memory: the key of a memory to bring in. backbone: a file of configs/backbone.
         options: the integration's own, as its YAML would give them.
-
-    Raises:
-        AssertionError: names the property that does not hold, and the values.
-        UserError: an unknown integration, memory or option, or a backbone that has no place for it.
     """
     sections = tiny_sections(f"{memory}_context", backbone)
     policy = build_small(sections | {"integration": {"name": name, **options}})
@@ -61,7 +57,6 @@ def build_small(sections: dict[str, Any]) -> MMEPolicy:
 
 
 def _loss(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens) -> Tensor:
-    """The loss [b] of each sample."""
     assert batch.actions is not None
     rows = []
     for row in (slice(i, i + 1) for i in range(len(batch.prompt))):
@@ -85,7 +80,6 @@ def check_reach(
 
 
 def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor) -> None:
-    """Samples do not see each other."""
     together, _ = policy(batch, draws, memory=memory)
     error = float((together - before.mean()).abs())
     assert error <= TOLERANCE, f"samples of one batch see each other: alone their loss differs by {error:.2g}."

@@ -27,10 +27,6 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     Args:
         name: the key in `MEMORIES`. frames: length of the episode, at least 40.
         options: the memory's own, as its YAML would give them.
-
-    Raises:
-        AssertionError: names the property that does not hold, and the values.
-        UserError: an unknown memory or option.
     """
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
     memory.eval()

@@ -12,10 +12,6 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
 
     Args:
         task: the key in `TASKS`. seed, difficulty: of the scene. options: the task's own keywords.
-
-    Raises:
-        AssertionError: names the property that does not hold, and the values.
-        UserError: an unknown task or option, or the simulator is not installed.
     """
     first, second = (_demonstrated(task, seed, difficulty, options) for _ in range(2))
     assert first["goal"], "goals() must give at least one wording."

@@ -14,7 +14,7 @@ from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.images import full_past
-from mme_vla.processing.normalise import NormStats, QuantileStats
+from mme_vla.processing.normalise import NormStats
 from mme_vla.types import Batch, HistoryTokens, PastViews
 
 PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
@@ -36,13 +36,7 @@ SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp
 
 def unit_stats(robot: Embodiment = ROBOMME_JOINT) -> NormStats:
     """Statistics that leave numbers about as they are."""
-
-    def quantiles(width: int) -> QuantileStats:
-        ones = np.ones(width)
-        low, high = -ones, ones.copy()
-        return QuantileStats(q01=low, q99=high, mean=np.zeros(width), std=ones.copy(), min=low, max=high)
-
-    return NormStats(state=quantiles(robot.state.width), actions=quantiles(robot.action.width))
+    return NormStats.unit(robot.state.width, robot.action.width)
 
 
 def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor, distributed, nn
 
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
 from mme_vla.policy.saving import save_settings
@@ -180,11 +180,11 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
 def read_state(checkpoint: Path) -> dict[str, Any]:
     """What `training_state.json` says."""
     path = checkpoint / STATE
-    if not path.is_file():
-        raise UserError(
-            f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
-            f"To start a new run from its weights use init_from={checkpoint}."
-        )
+    require(
+        path.is_file(),
+        f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
+        f"To start a new run from its weights use init_from={checkpoint}.",
+    )
     check_sums(checkpoint, [STATE])
     state: dict[str, Any] = read_json(inside(checkpoint, STATE), "a training state", limit=2**24)
     if state.get("format") != FORMAT:
@@ -194,11 +194,11 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:
         raise UserError(f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older one.")
     shards = state.get("shards", 0)
-    if len(shard_files(checkpoint)) != shards:
-        raise UserError(
-            f"{checkpoint} holds {len(shard_files(checkpoint))} of the {shards} files that its processes wrote: it is "
-            "incomplete. Copy the whole folder again, or resume from an older checkpoint."
-        )
+    require(
+        len(shard_files(checkpoint)) == shards,
+        f"{checkpoint} holds {len(shard_files(checkpoint))} of the {shards} files that its processes wrote: it is "
+        "incomplete. Copy the whole folder again, or resume from an older checkpoint.",
+    )
     for name in () if shards else (RAW, OPTIMIZER):
         if not (checkpoint / name).is_file():
             raise UserError(f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint.")
@@ -215,11 +215,11 @@ def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = Fal
     needed = (weights * (1 + sharded) + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
-    if needed > free:
-        raise UserError(
-            f"Checkpoints would take {needed / 1e9:.1f} GB in {folder} (train.keep.last={keep.last} and the one being "
-            f"written), but {free / 1e9:.1f} GB are free: make room, keep fewer, or choose another output."
-        )
+    require(
+        needed <= free,
+        f"Checkpoints would take {needed / 1e9:.1f} GB in {folder} (train.keep.last={keep.last} and the one being "
+        f"written), but {free / 1e9:.1f} GB are free: make room, keep fewer, or choose another output.",
+    )
 
 
 def tidy(folder: Path, keep: KeepRule) -> None:
@@ -232,18 +232,23 @@ def tidy(folder: Path, keep: KeepRule) -> None:
 
 
 def _places(folder: Path, step: int) -> tuple[Path, Path]:
-    """Where a checkpoint will be, and where it is written."""
     target = folder / checkpoint_name(step)
     return target, folder / f".{target.name}.partial"
 
 
 def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any) -> None:
-    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": _versions(), **more}
+    versions = {name: importlib.metadata.version(name) for name in ("mme-vla", "torch", "numpy")}
+    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": versions, **more}
     (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
 
 
 def _publish(draft: Path, target: Path) -> Path:
-    _flush(draft)
+    for path in (*draft.rglob("*"), draft):  # the disk holds all of it before the folder gets its final name
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
     replace_folder(draft, target)
     return target
 
@@ -260,7 +265,6 @@ def _read(path: Path) -> dict[str, Tensor]:
 
 
 def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = "") -> None:
-    """Refuse tensors that are missing, left over, misshapen or of another dtype."""
     names = set(tensors) ^ set(expected)
     wrong = sorted(names) + [
         f"{name}: {tuple(tensors[name].shape)} {tensors[name].dtype}"
@@ -268,22 +272,8 @@ def _check_fit(path: Path, tensors: Mapping[str, Tensor], expected: Mapping[str,
         if not (scalar and name.endswith(scalar))
         and (tensors[name].shape, tensors[name].dtype) != (expected[name].shape, expected[name].dtype)
     ]
-    if wrong:
-        raise UserError(
-            f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
-            "It belongs to another model or other settings."
-        )
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in ("mme-vla", "torch", "numpy")}
-
-
-def _flush(folder: Path) -> None:
-    """Have the disk hold what was written before the folder gets its final name."""
-    for path in (*folder.rglob("*"), folder):
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+    require(
+        not wrong,
+        f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
+        "It belongs to another model or other settings.",
+    )

@@ -11,7 +11,7 @@ from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.keyframes import KeyframeDataset
 from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import TrainsOnKeyframes, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
@@ -104,9 +104,9 @@ def prepare_data(
 
 def check_frozen(policy: Policy, freeze_vision: bool) -> None:
     """Refuse to train the vision tower under a memory, whose cached tokens would not follow it."""
-    if policy.memory is not None and not freeze_vision:
-        raise UserError(
-            "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "
-            "before: at test time it would see other tokens than in training. Keep it frozen "
-            "(finetune.freeze_vision=true), or train without a memory."
-        )
+    require(
+        policy.memory is None or freeze_vision,
+        "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "
+        "before: at test time it would see other tokens than in training. Keep it frozen "
+        "(finetune.freeze_vision=true), or train without a memory.",
+    )

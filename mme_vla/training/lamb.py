@@ -16,7 +16,6 @@ class ClippedLamb(Lamb):
         super().__init__(params, trust_clip=True, max_grad_norm=None, **options)
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """One update."""
         for group in self.param_groups:
             counts = [self.state[p]["step"] for p in group["params"] if p in self.state and "step" in self.state[p]]
             if counts:

@@ -15,19 +15,13 @@ from typing import IO, Any, Literal, Self
 
 import numpy as np
 import torch
-from accelerate.tracking import (
-    GeneralTracker,
-    MLflowTracker,
-    TensorBoardTracker,
-    TrackioTracker,
-    WandBTracker,
-)
+from accelerate.tracking import GeneralTracker, MLflowTracker, TensorBoardTracker, TrackioTracker, WandBTracker
 from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 from mme_vla.utils import read_lines, write_atomically
@@ -44,7 +38,6 @@ class Window:
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew."""
         self._sums: dict[str, Tensor | float] = {}
         self._counts: dict[str, int] = {}
         self._updates = 0
@@ -87,12 +80,12 @@ class Window:
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds
         values["speed/waiting_for_data"] = self._waited / seconds
         broken = [name for name, value in values.items() if not math.isfinite(value)]
-        if broken:
-            raise UserError(
-                f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was saved. "
-                "Resume from the last checkpoint with a lower train.lr in a new run (init_from=…), "
-                "or look for broken values in the data (python -m mme_vla.inspect dataset=…)."
-            )
+        require(
+            not broken,
+            f"{' and '.join(broken)} stopped being a number before step {step}; nothing of it was saved. "
+            "Resume from the last checkpoint with a lower train.lr in a new run (init_from=…), "
+            "or look for broken values in the data (python -m mme_vla.inspect dataset=…).",
+        )
         self.restart()
         return values
 
@@ -121,12 +114,10 @@ class ProgressLine:
             self._bar.stop()
 
     def advance(self) -> None:
-        """One update is done."""
         if self._bar is not None:
             self._bar.advance(self._task)
 
     def numbers(self, step: int, values: Mapping[str, float]) -> None:
-        """Show the latest training numbers."""
         text = (
             f"loss {values['train/loss']:.4f} · lr {values['train/lr']:.1e} · grad {values['train/grad_norm']:.2f} · "
             f"{values['speed/samples_per_s']:.1f} samples/s · {values['memory/gib']:.1f} GiB"
@@ -137,7 +128,6 @@ class ProgressLine:
             self.console.print(f"step {step}/{self._total} · {text}", markup=False)
 
     def say(self, text: str) -> None:
-        """Print a line that stays."""
         self.console.print(text, markup=False)
 
 
@@ -209,11 +199,7 @@ def trackio_tracker(
 
 @LOGGERS.register("mlflow")
 def mlflow_tracker(
-    folder: Path,
-    config: Mapping[str, Any],
-    first_step: int,
-    project: str = "mme_vla",
-    tracking_uri: str | None = None,
+    folder: Path, config: Mapping[str, Any], first_step: int, project: str = "mme_vla", tracking_uri: str | None = None
 ) -> GeneralTracker:
     """An MLflow run, in a file of the run folder or on a server; a resumed run continues the same one."""
     import mlflow
@@ -245,7 +231,6 @@ class Loggers:
         self._file, self._tracker = file, tracker
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record values after `step` updates."""
         if self._file is not None:
             self._file.write(json.dumps({"step": step, **values}) + "\n")
         if self._tracker is not None:
@@ -264,7 +249,6 @@ class Loggers:
                 tracker.log_artifact(str(path))
 
     def close(self) -> None:
-        """Write or send everything."""
         if self._file is not None:
             self._file.close()
         if self._tracker is not None:
@@ -274,17 +258,14 @@ class Loggers:
 def check_logger(config: Mapping[str, Any]) -> None:
     """Raise an error, before any long work, if the package of the logger that the section `logger` names is missing."""
     name = (config.get("logger") or {}).get("name")
-    if name in ("wandb", "trackio", "mlflow") and not _is_installed(name):
+    try:
+        is_installed = name not in ("wandb", "trackio", "mlflow") or find_spec(name) is not None
+    except ValueError:  # a module without a specification
+        is_installed = False
+    if not is_installed:
         if name == "wandb":
             raise missing_extra("logger=wandb", "wandb")
         raise UserError(f"logger={name} needs the package {name}: pip install -c constraints.txt {name}")
-
-
-def _is_installed(package: str) -> bool:
-    try:
-        return find_spec(package) is not None
-    except ValueError:  # a module without a specification
-        return False
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:
@@ -308,6 +289,5 @@ def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Lo
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`."""
     path = folder / METRICS
     return read_lines(path, dict, "metrics", finite=False) if path.exists() else []

@@ -18,14 +18,7 @@ from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import AugmentsImages
 from mme_vla.speed import Recomputes
-from mme_vla.training.checkpoint import (
-    checkpoint_name,
-    restore,
-    save_checkpoint,
-    save_shards,
-    tidy,
-    trainable,
-)
+from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, save_shards, tidy, trainable
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
@@ -124,7 +117,6 @@ class Trainer:
         """The signal that ended `run` early."""
 
     def describe(self) -> str:
-        """One line on what trains where."""
         total, trained = (sum(p.numel() for p in part) for part in (self.policy.parameters(), self._parameters))
         processes = f"{self.accelerator.num_processes} × " if self.accelerator.num_processes > 1 else ""
         return (

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mme_vla.data.dataset import TrainingDataset
-from mme_vla.embodiment import ActionSpace, Embodiment
+from mme_vla.embodiment import ActionSpace
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
 from mme_vla.types import stack_noise
@@ -82,6 +82,8 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     stats = processor.stats
     assert stats is not None
     half_range = (stats.actions.q99 - stats.actions.q01) / 2
+    robot = processor.embodiment
+    state_is_command = bool(robot.action.relative) and robot.action.width == robot.state.width
     kind = "held-out" if held_out else "training"
     data = samples.sources[source]
     return OpenLoop(
@@ -91,14 +93,9 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
         scale=np.where(half_range > 0, half_range, 1),
-        still=np.stack([step.state for step in recorded]) if _state_is_command(processor.embodiment) else None,
+        still=np.stack([step.state for step in recorded]) if state_is_command else None,
         space=data.robot.action,
     )
-
-
-def _state_is_command(robot: Embodiment) -> bool:
-    """Whether the state, given as the action, holds the robot still."""
-    return bool(robot.action.relative) and robot.action.width == robot.state.width
 
 
 def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:

@@ -57,12 +57,7 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) 
             groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay
         )
     return torch.optim.AdamW(
-        groups,
-        lr=settings.lr,
-        betas=settings.betas,
-        eps=settings.eps,
-        weight_decay=settings.weight_decay,
-        fused=True,
+        groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay, fused=True
     )
 
 
@@ -112,7 +107,6 @@ class EMA:
             average.copy_(like(average, tensors[name]))
 
     def tensors(self) -> dict[str, Tensor]:
-        """The averages by parameter name."""
         return dict(zip(self._parameters, self._average, strict=True))
 
     @contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 
 
@@ -39,17 +39,16 @@ class BatchOrder:
         process: int = 0,
         processes: int = 1,
     ) -> None:
-        """Order `samples` samples for the updates `steps`."""
-        if samples < batch_size:
-            raise UserError(
-                f"The training split has {samples} samples, fewer than train.batch_size={batch_size}: "
-                "lower the batch size or add data."
-            )
-        if batch_size % (accumulate * processes):
-            raise UserError(
-                f"train.batch_size={batch_size} counts the samples of one update over all processes: it must be a "
-                f"multiple of {processes} processes × train.accumulate={accumulate}."
-            )
+        require(
+            samples >= batch_size,
+            f"The training split has {samples} samples, fewer than train.batch_size={batch_size}: "
+            "lower the batch size or add data.",
+        )
+        require(
+            not (batch_size % (accumulate * processes)),
+            f"train.batch_size={batch_size} counts the samples of one update over all processes: it must be a "
+            f"multiple of {processes} processes × train.accumulate={accumulate}.",
+        )
         self.samples, self.batch_size, self.seed, self.steps = samples, batch_size, seed, steps
         self.accumulate, self.process, self.processes = accumulate, process, processes
         self.steps_per_epoch = samples // batch_size
@@ -83,7 +82,6 @@ MOST_AHEAD = 4  # batches a worker
 
 
 def size_of(item: Any) -> int:
-    """Bytes of all tensors in a sample."""
     if isinstance(item, Tensor):
         return item.nbytes
     if isinstance(item, Mapping):
@@ -105,8 +103,6 @@ def readers(workers: int, batch_bytes: int, most: float) -> tuple[int, int]:
 
 
 class Samples(Protocol):
-    """A map-style dataset."""
-
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Any: ...

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, distributed, nn
@@ -18,13 +18,13 @@ from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.config.sections import PositiveInt
+from mme_vla.errors import require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import recompute_buffers
 from mme_vla.speed import Sharded
 from mme_vla.speed.sharding import ShardGroup, float32_modules, stacked_layers
 
-STRATEGIES = ("auto", "ddp", "fsdp")
 FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
 FROM_FIRST = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
 
@@ -33,23 +33,17 @@ FROM_FIRST = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
 class ParallelSettings:
     """The keys of `train.parallel`, where each is explained."""
 
-    strategy: str = "auto"
-    replicate: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.strategy not in STRATEGIES:
-            raise UserError(f"train.parallel.strategy={self.strategy!r}. {did_you_mean(self.strategy, STRATEGIES)}")
-        if self.replicate is not None and self.replicate < 1:
-            raise UserError(f"train.parallel.replicate={self.replicate} must be at least 1, or null.")
+    strategy: Literal["auto", "ddp", "fsdp"] = "auto"
+    replicate: PositiveInt | None = None
 
     def shards(self, device: torch.device) -> bool:
         """Whether this run shards its weights: where that is asked for, and of itself on several GPUs."""
         started = distributed.is_available() and distributed.is_initialized()
-        if self.strategy == "fsdp" and not started:
-            raise UserError(
-                "train.parallel.strategy=fsdp shares the weights among processes, and this one was started alone: "
-                "start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or leave the strategy at auto."
-            )
+        require(
+            self.strategy != "fsdp" or started,
+            "train.parallel.strategy=fsdp shares the weights among processes, and this one was started alone: "
+            "start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or leave the strategy at auto.",
+        )
         if self.strategy == "auto":
             return started and distributed.get_world_size() > 1 and device.type == "cuda"
         return self.strategy == "fsdp"
@@ -59,8 +53,9 @@ class ParallelSettings:
         world = distributed.get_world_size()
         nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
         copies = nodes if self.replicate is None else self.replicate
-        if world % copies:
-            raise UserError(f"train.parallel.replicate={copies} must divide the number of processes, {world}.")
+        require(
+            not (world % copies), f"train.parallel.replicate={copies} must divide the number of processes, {world}."
+        )
         if copies == 1:
             return init_device_mesh(device_type, (world,), mesh_dim_names=("shard",))
         return init_device_mesh(device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard"))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, newest_checkpoint, resolve_checkpoint, step_of
 from mme_vla.policy.saving import policy_name
@@ -60,7 +60,7 @@ def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str
             run = open_run(place, resume, config)
             lock = FolderLock(run.folder, "training run").acquire()
         except UserError:
-            if named or resume is not None or not _in_use(place):
+            if named or resume is not None or not (_holds_run(place) or (place / LOCK).exists()):
                 raise
             continue
         try:
@@ -82,11 +82,11 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         config: the composed configuration, plain.
     """
     if resume is None:
-        if _holds_run(folder):
-            raise UserError(
-                f"{folder} already holds a training run, which is never overwritten: "
-                f"continue it with resume={folder}, or choose another output."
-            )
+        require(
+            not _holds_run(folder),
+            f"{folder} already holds a training run, which is never overwritten: "
+            f"continue it with resume={folder}, or choose another output.",
+        )
         return Run(folder)
     checkpoint = _newest_unfinished(folder) if resume == "auto" else resolve_checkpoint(Path(resume))
     if checkpoint is None:
@@ -104,16 +104,16 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."
         )
     steps = config["train"]["steps"]
-    if state["step"] > steps:
-        raise UserError(
-            f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give as many or more."
-        )
+    require(
+        state["step"] <= steps,
+        f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give as many or more.",
+    )
     newer = [path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]]
-    if newer:
-        raise UserError(
-            f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which continuing from "
-            f"{checkpoint.name} would overwrite: resume from the newest, or move those away."
-        )
+    require(
+        not newer,
+        f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which continuing from "
+        f"{checkpoint.name} would overwrite: resume from the newest, or move those away.",
+    )
     return Run(checkpoint.parent.parent, checkpoint, state["step"])
 
 
@@ -146,21 +146,18 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration with what runs of earlier versions did not say, because there was no other choice."""
     train = {f.name: f.default for f in fields(TrainSettings) if f.default is not MISSING and f.name != "seed"}
+    data = dict(config.get("data") or {})
+    if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:  # now the default
+        data["val_episodes"] = None
     return {
         **config,
         "embodiment": embodiment_of(config).to_dict(),
         "train": {**train, **config["train"]},
-        "data": _with_default_split(config.get("data") or {}),
+        "data": data,
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
         **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
     }
-
-
-def _with_default_split(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The section `data` as it is written now: runs on the shipped sample named the episode that is now the default."""
-    is_default = list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]
-    return {**data, "val_episodes": None} if is_default else dict(data)
 
 
 def _with_head(section: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,11 +177,6 @@ def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str
 
 def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
-
-
-def _in_use(folder: Path) -> bool:
-    """Whether a folder holds a run, or one that has not written anything yet."""
-    return _holds_run(folder) or (folder / LOCK).exists()
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -213,11 +205,11 @@ ASK, NONE = "ask", "none"
 
 def weights_to_start_from(init_from: str | None) -> str | None:
     """What `init_from` names; None for random weights."""
-    if init_from == ASK:
-        raise UserError(
-            "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
-            "To train the whole network from random weights, say so: init_from=none."
-        )
+    require(
+        init_from != ASK,
+        "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
+        "To train the whole network from random weights, say so: init_from=none.",
+    )
     return None if init_from in (None, NONE) else init_from
 
 

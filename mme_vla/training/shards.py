@@ -23,7 +23,7 @@ from torch.distributed.checkpoint.api import CheckpointException
 from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
 from torch.distributed.tensor import DTensor
 
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import listed, require
 from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
 from mme_vla.utils import Sums, decoding, inside, sum_line
@@ -136,7 +136,14 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)
     rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
-    sums = {file: _sums_of(checkpoint, file) for file in files}
+    sums: dict[Path, Sums] = {}
+    for file in files:
+        note = file.with_suffix(".sha256")
+        for path in (file, note):
+            inside(checkpoint, path.relative_to(checkpoint).as_posix())
+        sums[file] = Sums(file.parent, note.name)
+        require(file.name in sums[file].table, f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
+        check_header(file)
     for file in files[rank::world]:  # all together compare each file once
         sums[file].check(file.name)
     reader = dcp.HuggingFaceStorageReader(str(folder))
@@ -145,11 +152,11 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     shapes = {name: tensor.shape for name, tensor in tensors.items()}
     names = set(shapes) - set(stored) if others else set(shapes) ^ set(stored)
     wrong = sorted(names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]})
-    if wrong:
-        raise UserError(
-            f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
-            "It belongs to another model or other settings, or a file of it is missing."
-        )
+    require(
+        not wrong,
+        f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
+        "It belongs to another model or other settings, or a file of it is missing.",
+    )
     try:
         with _quiet():
             dcp.load(tensors, storage_reader=reader, no_dist=alone)
@@ -160,24 +167,11 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     check_values(local, str(folder))
 
 
-def _sums_of(checkpoint: Path, file: Path) -> Sums:
-    """The checksum of a shard, which every process writes beside its own."""
-    note = file.with_suffix(".sha256")
-    for path in (file, note):
-        inside(checkpoint, path.relative_to(checkpoint).as_posix())
-    sums = Sums(file.parent, note.name)
-    if file.name not in sums.table:
-        raise UserError(f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
-    check_header(file)
-    return sums
-
-
 def _decoding(folder: Path) -> AbstractContextManager[None]:
     return decoding(folder, "shards of a checkpoint", _REMEDY)
 
 
 def fresh_folder(draft: Path) -> None:
-    """An empty folder, made by the first process."""
     shutil.rmtree(draft, ignore_errors=True)
     (draft / SHARDS).mkdir(parents=True)
 

@@ -38,7 +38,7 @@ def stop_requests() -> Iterator[StopRequest]:
     request = StopRequest(lambda: request.event.is_set())
     event = request.event
     with _signals_set(request):
-        if not _several_processes():
+        if not (distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1):
             yield request
             return
         # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
@@ -64,10 +64,6 @@ def leave_signals_alone(worker: int) -> None:
     for number in ANSWERED:
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-
-
-def _several_processes() -> bool:
-    return distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
 
 
 @contextmanager

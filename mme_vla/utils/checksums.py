@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.utils.io import inside, read_text, write_atomically
 
 SUMS = "SHA256SUMS"
@@ -63,17 +63,17 @@ class Sums:
         """Compare these files, each the first time it is asked about; one that is not listed is not checked."""
         paths = {name: inside(self.folder, name) for name in names if name in self.table and name not in self._compared}
         for path in paths.values():
-            if not path.is_file():
-                raise UserError(
-                    f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again."
-                )
+            require(
+                path.is_file(),
+                f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again.",
+            )
         with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
             for (name, path), checksum in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
-                if checksum != self.table[name]:
-                    raise UserError(
-                        f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "
-                        f"{self.remedy}; if you changed it on purpose, delete {self.name}."
-                    )
+                require(
+                    checksum == self.table[name],
+                    f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "
+                    f"{self.remedy}; if you changed it on purpose, delete {self.name}.",
+                )
         self._compared |= set(paths)
 
 
@@ -94,7 +94,6 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
 
 
 def _read_sums(sums: Path) -> dict[str, str]:
-    """The table in a list of checksums: name → SHA-256."""
     table = {}
     for number, line in enumerate(read_text(sums, "a list of checksums").split("\n"), start=1):
         match = _LINE.fullmatch(line)

@@ -19,9 +19,9 @@ from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 
 # "errno = 28" (HDF5), "os error 28" (Rust)
 _NUMBER = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
@@ -93,13 +93,11 @@ def require_file(path: Path, what: str = "a file") -> Path:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UserError(f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
-    if not stat.S_ISREG(mode):
-        raise UserError(f"{_short_path(path)} is not a file; expected {what}.")
+    require(stat.S_ISREG(mode), f"{_short_path(path)} is not a file; expected {what}.")
     return path
 
 
 def _short_path(path: Path) -> str:
-    """A path in a message; an untrusted file may have given it a name of any length."""
     return brief(str(path), 300, quote=False)
 
 
@@ -134,11 +132,11 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
         resolved = Path("/")
     within = resolved.is_relative_to(root) and resolved != root
     linked = ".." not in Path(name).parts and any(resolved.is_relative_to(blobs) for blobs in _blobs_of(root))
-    if not name or Path(name).is_absolute() or not (within or linked):
-        raise UserError(
-            f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
-            "dataset's own folder is read for it; copy the file into the folder, or correct the name."
-        )
+    require(
+        name and not Path(name).is_absolute() and (within or linked),
+        f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
+        "dataset's own folder is read for it; copy the file into the folder, or correct the name.",
+    )
     return place
 
 
@@ -157,11 +155,11 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 
 def safe_name(name: str, what: str = "name") -> str:
     """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most 100 characters."""
-    if not isinstance(name, str) or not _SAFE_NAME.fullmatch(name):
-        raise UserError(
-            f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -, "
-            "beginning with a letter or digit."
-        )
+    require(
+        isinstance(name, str) and _SAFE_NAME.fullmatch(name),
+        f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -, "
+        "beginning with a letter or digit.",
+    )
     return name
 
 
@@ -183,10 +181,8 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as file:
             status = os.fstat(file.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise UserError(f"{path} is not a file; expected {what}.")
-            if status.st_size > limit:
-                raise UserError(f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
+            require(stat.S_ISREG(status.st_mode), f"{path} is not a file; expected {what}.")
+            require(status.st_size <= limit, f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
             return file.read(status.st_size + 1)  # reading `limit` would allocate it, whatever the size
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
@@ -230,7 +226,7 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
     """
     try:
         # Python's own constants are looked at only where they are refused: hooks slow the parser down.
-        value = json.loads(text, parse_float=_finite, parse_constant=_no_constant) if finite else json.loads(text)
+        value = json.loads(text, parse_float=_finite, parse_constant=_finite) if finite else json.loads(text)
     except RecursionError:
         raise UserError(f"{source} is nested too deeply to be JSON of this library.") from None
     except (ValueError, OverflowError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors
@@ -309,10 +305,10 @@ def to_dataclass[T](cls: type[T], values: Mapping[str, Any]) -> T:
     types, members = _type_hints(cls), {member.name: member for member in fields(cls)}  # type: ignore[arg-type]
     required = [n for n, m in members.items() if m.default is MISSING and m.default_factory is MISSING]
     missing, unknown = sorted(set(required) - set(values)), sorted(set(values) - set(members))
-    if missing or unknown:
-        raise UserError(
-            f"not a {cls.__name__}: missing {listed(missing) or 'nothing'}, unknown {listed(unknown) or 'nothing'}."
-        )
+    require(
+        not missing and not unknown,
+        f"not a {cls.__name__}: missing {listed(missing) or 'nothing'}, unknown {listed(unknown) or 'nothing'}.",
+    )
     for name, value in values.items():
         if not _is_of(value, types[name]):
             raise UserError(f"{cls.__name__}.{name}={brief(value)}: expected {_type_name(types[name])}.")
@@ -373,14 +369,11 @@ def to_json(value: Any) -> Any:
 
 
 def _finite(text: str) -> float:
-    value = float(text)
-    if math.isinf(value):
+    if text in ("NaN", "Infinity", "-Infinity"):  # Python's own constants
+        raise ValueError(f"{text} is not a number")
+    if math.isinf(value := float(text)):
         raise ValueError(f"the number {brief(text)} is out of range")
     return value
-
-
-def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a number")
 
 
 _DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")

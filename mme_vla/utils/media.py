@@ -93,7 +93,6 @@ def video_bytes(frames: Iterable[np.ndarray], **options: Any) -> bytes:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """An image as PNG."""
     from PIL import Image
 
     buffer = BytesIO()
@@ -191,7 +190,6 @@ def evenly_spaced(count: int, limit: int) -> list[int]:
 
 
 def thumbnail(image: np.ndarray, side: int = TILE) -> "Image":
-    """The image as a square of `side` pixels."""
     from PIL import Image
 
     return Image.fromarray(image).resize((side, side), Image.Resampling.LANCZOS)

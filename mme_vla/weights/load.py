@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.saving import recompute_buffers
@@ -60,18 +60,14 @@ def load_weights(
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
         dtype: what the weights become, whatever they are stored in. revision, token: of a hub repository.
         base: what a run of OpenVLA-OFT was trained on, where it holds its adapters alone.
-
-    Raises:
-        UserError: no such checkpoint, a damaged one, or one that does not fit; every tensor that is missing, left over
-            or misshapen is listed, and nothing is changed.
     """
     kind = dtype_of(dtype)
     checkpoint = open_source(source, revision, token, base)
-    if checkpoint.format == "openpi" and policy.memory is not None:
-        raise UserError(
-            f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
-            "To begin training from it use start_from() (on the command line: init_from=…)."
-        )
+    require(
+        checkpoint.format != "openpi" or policy.memory is None,
+        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
+        "To begin training from it use start_from() (on the command line: init_from=…).",
+    )
     stats, datasets = None, list(stats_files(checkpoint.folder))
     if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
         stats = read_stats(checkpoint.folder)
@@ -111,7 +107,6 @@ class Start:
     left: list[str]
 
     def __str__(self) -> str:
-        """A sentence for the screen."""
         sentence = f"{len(self.taken)} tensors taken, {len(self.new)} new ({_groups(self.new)})"
         return sentence + (f", {len(self.left)} left behind ({_groups(self.left)})" if self.left else "")
 
@@ -180,12 +175,12 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
         return
     source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
     processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
-    if source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint:
-        raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than "
-            f"{processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other words. Set "
-            "processor.tokenizer to that one."
-        )
+    require(
+        source_fingerprint is None or target_fingerprint is None or source_fingerprint == target_fingerprint,
+        f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than "
+        f"{processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other words. Set "
+        "processor.tokenizer to that one.",
+    )
 
 
 def _reduced(

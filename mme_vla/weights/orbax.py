@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, missing_extra
+from mme_vla.errors import UserError, brief, missing_extra, require
 from mme_vla.utils import decoding, inside, read_text, require_file, safe_name
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
@@ -82,7 +82,11 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
     if isinstance(params, Zipped):
         params.check()
     else:
-        _check_files(params)
+        for place in params.rglob("*"):
+            if place.is_symlink():
+                inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
+            if not place.is_dir():  # tensorstore would wait for a pipe without end
+                require_file(place, "a part of an Orbax checkpoint")
     ocdbt = (params / MANIFEST).is_file() if isinstance(params, Path) else MANIFEST in params.names
     try:
         arrays = _list_arrays(ts, params, ocdbt)
@@ -96,7 +100,13 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
         }  # fmt: skip
         # All are asked for before the first is waited for, so that reading overlaps.
         stores = {name: opened.result() for name, opened in pending.items()}
-        _check_chunks(stores, params)
+        for name, store in stores.items():  # a few bytes on disk would fill the memory
+            piece = math.prod(store.chunk_layout.read_chunk.shape or ())
+            require(
+                piece <= max(2 * math.prod(store.shape), _SMALL_PIECE),
+                f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
+                f"lie in pieces of {piece:,} numbers.",
+            )
         if fits is not None:
             fits({name: torch.empty(store.shape, device="meta") for name, store in stores.items()})
         reads = {name: store.read() for name, store in stores.items()}
@@ -106,28 +116,8 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
     except (ValueError, TypeError, RuntimeError, OverflowError) as error:  # what tensorstore, or torch, cannot read
         reason = brief(str(error).splitlines()[0], 500, quote=False)
         raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
-    if not tree:
-        raise UserError(f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
+    require(tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
-
-
-def _check_files(params: Path) -> None:
-    for place in params.rglob("*"):
-        if place.is_symlink():
-            inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
-        if not place.is_dir():  # tensorstore would wait for a pipe without end
-            require_file(place, "a part of an Orbax checkpoint")
-
-
-def _check_chunks(stores: Mapping[str, Any], params: Path | Zipped) -> None:
-    """Refuse arrays whose pieces are larger than they are: a few bytes on disk would fill the memory."""
-    for name, store in stores.items():
-        piece = math.prod(store.chunk_layout.read_chunk.shape or ())
-        if piece > max(2 * math.prod(store.shape), _SMALL_PIECE):
-            raise UserError(
-                f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
-                f"lie in pieces of {piece:,} numbers."
-            )
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
@@ -164,7 +154,6 @@ def _holds_arrays(folder: Path) -> bool:
 
 
 def _list_arrays(ts: Any, params: Path | Zipped, ocdbt: bool) -> dict[str, tuple[str, str]]:
-    """Path in the store → (name, driver) of every array."""
     if ocdbt:
         keys = [key.decode() for key in ts.KvStore.open(_store(params, "", True)).result().list().result()]
     elif isinstance(params, Zipped):
@@ -224,25 +213,14 @@ _REMEDY = "Download or copy it again."
 _facts: dict[tuple[Path, int], tempfile.TemporaryDirectory[str]] = {}
 
 
-@dataclass(frozen=True)
-class Archive:
-    """An archive that holds a checkpoint.
-
-    params: where its arrays are. folder: what says its variant, and its statistics, unpacked until the program ends.
-    """
-
-    params: Zipped
-    folder: Path
-
-
 def find_archive(folder: Path) -> Path | None:
     """The archive of the newest step in a folder, such as `79999.zip`; None without any."""
     steps = [file for file in folder.glob(f"*{ARCHIVE_SUFFIX}") if file.stem.isdigit()]
     return max(steps, key=lambda file: int(file.stem)) if steps else None
 
 
-def open_archive(file: Path) -> Archive:
-    """Look through an archive and find the checkpoint in it."""
+def open_archive(file: Path) -> tuple[Zipped, Path]:
+    """Find the checkpoint in an archive: its arrays, and a folder of its variant's name and statistics, unpacked."""
     with decoding(file, "a zip archive", _REMEDY), zipfile.ZipFile(file) as opened:
         entries = [entry for entry in opened.infolist() if not entry.is_dir()]
         _check(file, entries, opened.start_dir)
@@ -252,7 +230,7 @@ def open_archive(file: Path) -> Archive:
             raise UserError(f"{file} holds no checkpoint of the released code: there are no Orbax arrays in it.")
         within = tuple(name.removeprefix(place) for name in names if name.startswith(place))
         folder = _unpack_facts(file, opened, entries)
-    return Archive(Zipped(file.resolve(), place, within), folder)
+    return Zipped(file.resolve(), place, within), folder
 
 
 def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
@@ -264,21 +242,15 @@ def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
         name, parts = entry.filename, entry.filename.split("/")
         if name.startswith("/") or "\\" in name or ".." in parts or ":" in parts[0]:
             raise UserError(f"{file} names {brief(name)}, which lies outside of it. {_REMEDY}")
-        if entry.flag_bits & 1:
-            raise UserError(f"{file} is encrypted: unpack it yourself, and name the folder.")
+        require(not (entry.flag_bits & 1), f"{file} is encrypted: unpack it yourself, and name the folder.")
         if entry.file_size > _SMALL and entry.file_size > _MOST_RATIO * max(entry.compress_size, 1):
             raise UserError(f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no checkpoint.")
     if total > _SMALL and total > _MOST_RATIO * packed:
         raise UserError(f"{file}: {packed:,} bytes unpack to {total:,}: that is no checkpoint.")
-    _check_distinct(file, entries, end)
-
-
-def _check_distinct(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
-    """Refuse names and bytes that stand twice: what is compared with its checksum might not be what is read."""
+    # Names and bytes that stand twice: what is compared with its checksum might not be what is read.
     names: set[str] = set()
     for entry in entries:
-        if entry.filename in names:
-            raise UserError(f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
+        require(entry.filename not in names, f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
         names.add(entry.filename)
     ordered = sorted(entries, key=lambda entry: entry.header_offset)
     ends = [*(entry.header_offset for entry in ordered[1:]), end]
@@ -315,8 +287,7 @@ def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.Zip
             target = folder / "assets" / safe_name(above[-1]) / last
         else:
             continue
-        if entry.file_size > _SMALL:
-            raise UserError(f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}")
+        require(entry.file_size <= _SMALL, f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}")
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(opened.read(entry))
     return folder

@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import past_view_spec
 from mme_vla.memory.extensions.spacetime import SpaceTime
 from mme_vla.policy.base import Policy
@@ -63,16 +63,15 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
     spelled: dict[str, str] = {}
     for name in tensors:
         taken = spelled.setdefault(_respell(name), name)
-        if taken != name:
-            raise UserError(f"{source} holds the same tensor twice, as {taken} and as {name}.")
+        require(taken == name, f"{source} holds the same tensor twice, as {taken} and as {name}.")
     renamed = {name: tensors[source_name] for name, source_name in spelled.items()}
     adaptive = any(name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in renamed)
-    if not adaptive or any(_PI0.match(name) for name in renamed):
-        raise UserError(
-            f"{source} is not π0.5: its action expert has "
-            + ("a state projection" if adaptive else "no time-conditioned norms")
-            + ", as π0 has. Only π0.5 checkpoints fit."
-        )
+    require(
+        adaptive and not any(_PI0.match(name) for name in renamed),
+        f"{source} is not π0.5: its action expert has "
+        + ("a state projection" if adaptive else "no time-conditioned norms")
+        + ", as π0 has. Only π0.5 checkpoints fit.",
+    )
     if names.EMBEDDING not in renamed and names.HEAD in renamed:
         renamed[names.EMBEDDING] = renamed[names.HEAD]
     return renamed
@@ -94,11 +93,11 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
     """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's."""
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
-    if not any(has.values()) and policy.memory is not None:
-        raise UserError(
-            f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
-            "To begin training from it use start_from() (on the command line: init_from=…)."
-        )
+    require(
+        any(has.values()) or policy.memory is None,
+        f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
+        "To begin training from it use start_from() (on the command line: init_from=…).",
+    )
     if any(has.values()):
         has |= {source_name: config.get(source_name, default) for source_name, (_, default) in WINDOW.items()}
     between = getattr(getattr(policy, "integration", None), "mutual", False)

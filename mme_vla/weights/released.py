@@ -21,7 +21,6 @@ from mme_vla.weights.tables import Adapter, Derived, NameTable, Unread, memory_p
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
-    """The released tree of this policy."""
     return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
 
 

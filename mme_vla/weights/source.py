@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.errors import UserError, brief, did_you_mean, listed, require
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.utils import decoding, require_file
@@ -52,7 +52,6 @@ class MethodFormat:
     stats: str | None = None
 
     def function(self, role: str) -> Callable[..., Any]:
-        """Import one of the functions."""
         name: str = getattr(self, role)
         function: Callable[..., Any] = getattr(importlib.import_module(self.module), name)
         return function
@@ -85,11 +84,7 @@ def _openvla() -> Any:
     return importlib.import_module(METHOD_FORMATS["openvla"].module)
 
 
-VARIANTS = {
-    "pi05_baseline": "pi05",
-    "symbolic-simple-subgoal": "simplesg",
-    "symbolic-grounded-subgoal": "groundsg",
-} | {
+VARIANTS = {"pi05_baseline": "pi05", "symbolic-simple-subgoal": "simplesg", "symbolic-grounded-subgoal": "groundsg"} | {
     f"{kind}-{memory}-{integration}": f"{memory}_{integration}"
     for kind, memories in (("perceptual", ("framesamp", "tokendrop")), ("recurrent", ("rmt", "ttt")))
     for memory in memories
@@ -137,7 +132,6 @@ class Source:
 
     @property
     def label(self) -> str:
-        """Where it is, for messages."""
         return str(self.params if isinstance(self.params, Zipped) else self.folder)
 
     @property
@@ -159,12 +153,12 @@ class Source:
             name = variant_of([self.folder, *beside])
             if name is None:  # published runs lie in folders that are called as they are
                 name = next((folder.name for folder in beside if folder.name in VARIANTS), None)
-        if name is not None and name not in VARIANTS:
-            # The word would become part of a configuration, where it could ask for more than a name.
-            raise UserError(
-                f"history_config.txt beside {self.folder} says {brief(name)}, no variant of the released code. "
-                f"{did_you_mean(brief(name), VARIANTS)}"
-            )
+        # The word would become part of a configuration, where it could ask for more than a name.
+        require(
+            name is None or name in VARIANTS,
+            f"history_config.txt beside {self.folder} says {brief(name)}, no variant of the released code. "
+            f"{did_you_mean(brief(name), VARIANTS)}",
+        )
         return None if name is None else VARIANTS[name]
 
 
@@ -184,8 +178,7 @@ def open_source(
         base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for it is not followed.
     """
     path = local_folder(source, revision, token)
-    if not path.exists():
-        raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
+    require(path.exists(), f"No checkpoint at {path}: there is no such file or folder.")
     if not path.is_dir():
         require_file(path, "a checkpoint")
     is_local = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
@@ -195,10 +188,10 @@ def open_source(
                 f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does not: leave it out."
             )
         base_source = open_source(base)
-        if base_source.format != "openvla":
-            raise UserError(
-                f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are OpenVLA's."
-            )
+        require(
+            base_source.format == "openvla",
+            f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are OpenVLA's.",
+        )
         return Source("openvla", path, base=base_source)
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
@@ -221,16 +214,15 @@ def open_source(
         )
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
-    if files:
-        raise UserError(f"{path} holds {listed(file.name for file in files)}: name the one you mean.")
+    require(not files, f"{path} holds {listed(file.name for file in files)}: name the one you mean.")
     if (path / "adapter_model.safetensors").is_file():
         raise UserError(f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first.")
     raise UserError(f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}.")
 
 
 def _of_archive(file: Path) -> Source:
-    archive = open_archive(file)
-    return Source("released", archive.folder, params=archive.params)
+    params, folder = open_archive(file)
+    return Source("released", folder, params=params)
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
@@ -264,7 +256,6 @@ def _of_torch_file(path: Path) -> Source:
 
 
 def _names(file: Path) -> list[str]:
-    """Tensor names in a safetensors file's header."""
     from safetensors import safe_open
 
     check_header(file)

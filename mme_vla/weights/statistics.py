@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import check_sums, inside, read_json
@@ -33,19 +33,12 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     files = stats_files(folder)
     if asset is not None or len(files) > 1:
         if asset not in files:
-            raise UserError(
-                f"{folder} holds statistics of {listed(files) or 'no dataset'}: "
-                + (
-                    f"there are none of {brief(asset)}."
-                    if asset
-                    else "say which: --asset, or read_stats(folder, asset)."
-                )
-            )
+            reason = f"none of {brief(asset)}." if asset else "say which: --asset, or read_stats(folder, asset)."
+            raise UserError(f"{folder} holds statistics of {listed(files) or 'no dataset'}: {reason}")
         return NormStats.load(_local_file(folder, files[asset]))
+    files |= {"": folder / "norm_stats.json"} if (folder / "norm_stats.json").is_file() else {}
     if files:
         return NormStats.load(_local_file(folder, next(iter(files.values()))))
-    if (folder / "norm_stats.json").is_file():
-        return NormStats.load(_local_file(folder, folder / "norm_stats.json"))
     for fmt in METHOD_FORMATS.values():
         if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
             return stats
@@ -66,8 +59,7 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
         if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
             raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
         for file in (step["state_file"] for step in steps if step.get("state_file")):
-            if not isinstance(file, str):
-                raise UserError(f"{folder / name}: state_file={brief(file)} must be the name of a file.")
+            require(isinstance(file, str), f"{folder / name}: state_file={brief(file)} must be the name of a file.")
             tensors = read_safetensors(inside(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
                 yield NormStats(**{target: _quantiles(tensors, source) for target, source in _FEATURES.items()})

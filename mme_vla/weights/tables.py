@@ -13,7 +13,7 @@ from einops import rearrange
 from torch import Tensor
 
 from mme_vla.backbone.pi05 import Pi05Backbone
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import check_fit
 
@@ -77,19 +77,16 @@ def prefixed(prefix: str, table: NameTable) -> NameTable:
     return {f"{prefix}.{name}": pieces for name, pieces in table.items()}
 
 
-def linear(path: str, *, layer: int | None = None, bias: bool = True) -> NameTable:
+def linear(path: str, *, layer: int | None = None) -> NameTable:
     """A linear layer stored as kernel (in, out), with its bias."""
-    table: NameTable = {"weight": [Piece(f"{path}/kernel", "i o -> o i", layer=layer)]}
-    if bias:
-        table["bias"] = [Piece(f"{path}/bias", layer=layer)]
-    return table
+    kernel, bias = Piece(f"{path}/kernel", "i o -> o i", layer=layer), Piece(f"{path}/bias", layer=layer)
+    return {"weight": [kernel], "bias": [bias]}
 
 
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Translate a foreign checkpoint into our names and layouts."""
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
-    if missing:
-        raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
+    require(not missing, f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
     target = {}
     for name, pieces in table.items():
         try:
@@ -99,18 +96,6 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
             raise UserError(f"{name} cannot be made of {shapes}: {error}") from error
         target[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
     return target
-
-
-def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
-    """Make sure that the constants a checkpoint stores are the ones this configuration gives."""
-    for constant in derived:
-        if constant.path in source:
-            stored, expected = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
-            if stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2):
-                raise UserError(
-                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
-                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here."
-                )
 
 
 def write(
@@ -163,11 +148,11 @@ class Adapter:
     def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Write our tensors in the foreign names and layouts, the three lists included."""
         homeless = sorted(set(target) - set(self.table))
-        if homeless:
-            raise UserError(
-                f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
-                "policies without adapters: convert another policy, merge the adapters first, or choose another format."
-            )
+        require(
+            not homeless,
+            f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
+            "policies without adapters: convert another policy, merge the adapters first, or choose another format.",
+        )
         released = write(self.table, self.unread, target, self.derived)
         return released | {name: released[original] for name, original in self.tied.items()}
 
@@ -181,7 +166,14 @@ class Adapter:
     def translate(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
         """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
-        check(self.derived, released)
+        for constant in self.derived:  # what a checkpoint stores of them is what this configuration gives
+            if constant.path in released:
+                stored, expected = (x.real.float().cpu() for x in (released[constant.path], constant.make()))
+                require(
+                    stored.shape == expected.shape and torch.allclose(stored, expected, rtol=1e-2, atol=1e-2),
+                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
+                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here.",
+                )
         derived = {constant.path for constant in self.derived}
         return read(self.table, {name: tensor for name, tensor in released.items() if name not in derived})
 

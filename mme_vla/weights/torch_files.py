@@ -15,7 +15,6 @@ MODEL = ("model", "state_dict", "model_state_dict", "model_state")
 
 
 def find_torch_files(folder: Path) -> list[Path]:
-    """The files of this kind in a folder."""
     return sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file())
 
 

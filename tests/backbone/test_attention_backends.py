@@ -6,7 +6,7 @@ from torch import Tensor
 
 from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
-from mme_vla.backbone.attention import MaskLayout, Visibility, attend, build_mask, select_rows
+from mme_vla.backbone.layers import MaskLayout, Visibility, attend, build_mask, select_rows
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 
 OTHERS = ["flex", "varlen"]

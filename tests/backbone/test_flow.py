@@ -5,7 +5,7 @@ import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.backbone import flow
-from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.testing.small import small_policy
 
 CPU = torch.device("cpu")
 
@@ -28,15 +28,6 @@ def test_uniform_times_are_an_option():
     )
     with pytest.raises(UserError, match="time_distribution"):
         build_policy("pi05", backbone={"time_distribution": "normal"})
-
-
-def test_the_sampled_times_follow_the_option(monkeypatch):
-    shapes = []
-    monkeypatch.setattr(flow, "sample_time", lambda n, kind, *_: (n and shapes.append(kind)) or torch.full((n,), 0.5))
-    for kind in ("beta", "uniform"):
-        policy = small_policy("pi05", backbone={"time_distribution": kind})
-        policy(random_batch(policy))
-    assert shapes == ["beta", "uniform"]
 
 
 def test_the_path_runs_from_actions_to_noise():

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
-from mme_vla.backbone import attention, gemma
-from mme_vla.backbone.attention import (
+from mme_vla.backbone import gemma, layers
+from mme_vla.backbone.layers import (
     ALIGNMENT,
     BIG_NEGATIVE,
     PI05_VISIBILITY,
@@ -31,11 +31,6 @@ def test_what_a_valid_token_sees_is_what_the_table_says(table: Visibility) -> No
     layout = MaskLayout.of(spans, spans, valid, table)
     assert torch.equal(layout.expand(layout.visible) & valid[:, :, None], expected)
     assert sum(layout.lengths) == valid.shape[1] and len(layout.lengths) <= len(spans)
-
-
-def test_neighbours_that_see_the_same_are_one_run() -> None:
-    spans = blocks_of(PI05_VISIBILITY)
-    assert MaskLayout.of(spans, spans, validity(18), PI05_VISIBILITY).lengths == (12, 6)
 
 
 def test_a_subset_of_the_queries_has_the_mask_rows_of_all_queries() -> None:
@@ -94,7 +89,7 @@ def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
         return MaskLayout((1,) * asking.shape[1], attention_mask(spans, keys, asking, valid, table))
 
     monkeypatch.setattr(gemma.MaskLayout, "of", as_it_was)
-    monkeypatch.setattr(attention, "BIG_NEGATIVE", -2.3819763e38)
+    monkeypatch.setattr(layers, "BIG_NEGATIVE", -2.3819763e38)
     before = results()
     assert torch.equal(now[0], before[0]) and torch.equal(now[2], before[2])
     assert now[1].keys() == before[1].keys()

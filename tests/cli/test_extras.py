@@ -8,9 +8,9 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cache
-from importlib.metadata import Distribution, distributions
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 from typing import NamedTuple
 
@@ -142,6 +142,36 @@ def run(case: Case, folder: Path) -> tuple[int, str]:
 
 
 @cache
+def needs() -> dict[str, set[str]]:
+    """The packages that each extra names; those of the library itself under an empty name."""
+    packages: dict[str, set[str]] = {}
+    for requirement in map(Requirement, requires("mme-vla") or []):
+        extra = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
+        packages.setdefault(extra[1] if extra else "", set()).add(canonicalize_name(requirement.name))
+    return packages
+
+
+@cache
+def modules() -> dict[str, set[str]]:
+    """The modules of each installed package; a namespace that several share belongs to none."""
+    owned: dict[str, set[str]] = {}
+    for module, owners in packages_distributions().items():
+        if len(set(owners)) == 1:
+            owned.setdefault(canonicalize_name(owners[0]), set()).add(module)
+    return owned | {"google-genai": {"google.genai"}}
+
+
+def is_installed(extra: str) -> bool:
+    return all(package in modules() for package in needs()[extra])
+
+
+def hidden(extras: Sequence[str]) -> set[str]:
+    """Modules of the packages that only other extras name."""
+    present = set().union(*(needs()[extra] for extra in ("", *extras)))
+    return {module for package in set().union(*needs().values()) - present for module in modules().get(package, ())}
+
+
+@cache
 def can_draw() -> bool:
     from mme_vla.envs.rendering import render_backend
 
@@ -191,96 +221,4 @@ def test_every_command_is_among_the_cases() -> None:
 
 def test_each_extra_is_among_the_cases() -> None:
     # What is behind an address answers only to who has a key.
-    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"dev", "gemini", "openai", "wandb"}
-
-
-def test_what_is_hidden_is_what_only_other_extras_bring() -> None:
-    assert {"websockets", "msgpack"} <= set(hidden(("sim",))) or not is_installed("serve")
-    for extra in filter(is_installed, needs()):
-        assert {module_of(name) for name in needs()[extra]} & set(hidden((extra,))) == set()
-    assert {"torch", "lerobot", "hydra", "google.protobuf"} & set(hidden(())) == set()
-
-
-@cache
-def installed() -> dict[str, Distribution]:
-    return {canonicalize_name(distribution.metadata["Name"]): distribution for distribution in distributions()}
-
-
-@cache
-def needs() -> dict[str, list[str]]:
-    """The packages that each extra names."""
-    requirements: dict[str, list[str]] = {}
-    for requirement in required("mme-vla"):
-        named = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
-        if named:
-            requirements.setdefault(named[1], []).append(canonicalize_name(requirement.name))
-    return requirements
-
-
-@cache
-def required(name: str) -> list[Requirement]:
-    return [Requirement(line) for line in installed()[name].requires or []]
-
-
-def is_installed(extra: str) -> bool:
-    return all(name in installed() for name in needs()[extra])
-
-
-def closure(names: Iterable[tuple[str, str]]) -> set[str]:
-    """Distributions, and all that they need; each with the extra that is asked of it."""
-    visited: set[tuple[str, str]] = set()
-    pending = list(names)
-    while pending:
-        name, extra = pending.pop()
-        if (name, extra) in visited or name not in installed():
-            continue
-        visited.add((name, extra))
-        for requirement in required(name):
-            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
-                pending += [(canonicalize_name(requirement.name), each) for each in ("", *requirement.extras)]
-    return {name for name, _ in visited}
-
-
-@cache
-def modules() -> dict[str, set[str]]:
-    """Each module and package, down to the first folder with an `__init__`, and the distributions that bring it."""
-    owners: dict[str, set[str]] = {}
-    listed = {name: (paths.read_text("RECORD") or "").splitlines() for name, paths in installed().items()}
-    files = {name: {line.partition(",")[0] for line in lines} for name, lines in listed.items()}
-    packages = {file.removesuffix("/__init__.py") for each in files.values() for file in each}
-    for name, each in files.items():
-        for file in each:
-            if not file.endswith((".py", ".so")) or file.startswith("..") or ".dist-info/" in file:
-                continue
-            inside = ""
-            for part in file.split("/"):
-                inside = f"{inside}/{part}".lstrip("/")
-                owners.setdefault(dotted(inside), set()).add(name)
-                if inside in packages:
-                    break
-    return owners
-
-
-def dotted(file: str) -> str:
-    """The module that a file is: `a/b.cpython-312.so` is `a.b`."""
-    folder, _, name = file.rpartition("/")
-    return f"{folder.replace('/', '.')}.{name.partition('.')[0]}".lstrip(".")
-
-
-@cache
-def hidden(extras: Sequence[str]) -> list[str]:
-    """Modules that would not be there if only these extras were installed."""
-    there = closure([("mme-vla", ""), *(("mme-vla", extra) for extra in extras)])
-    return sorted(module for module, owners in modules().items() if not owners & there)
-
-
-def module_of(distribution: str) -> str:
-    return next((m for m, owners in modules().items() if distribution in owners and "." not in m), distribution)
-
-
-def test_install_lines_name_what_a_clone_has_and_no_index() -> None:
-    pages = [REPOSITORY / "README.md", *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("mme_vla/**/*.py")]
-    text = {page.name: page.read_text() for page in pages}
-    assert [name for name, content in text.items() if re.search(r"pip install \S*mme-vla", content)] == []
-    named = {extra for content in text.values() for extra in re.findall(r"--extra ([a-z]\w*)", content)}
-    assert {"sim", "serve"} <= named <= set(needs())
+    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"", "dev", "gemini", "openai", "wandb"}

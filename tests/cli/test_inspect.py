@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 from rich.console import Console
@@ -19,8 +18,6 @@ from mme_vla.cli.inspect import (
 )
 from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.memory_image import memory_sheet
-from mme_vla.utils.media import MARGIN, TILE
 
 
 @pytest.fixture
@@ -54,25 +51,6 @@ def test_a_memory_is_rendered_as_it_selects(sample: EpisodeSource, console: Cons
     with Image.open(path) as image:
         assert image.width > 800
     assert f"of {memory.budget} tokens" in console.export_text()
-
-
-def test_remembered_patches_keep_their_colour_and_others_are_dimmed() -> None:
-    frames = np.zeros((3, 64, 64, 3), np.uint8)
-    frames[..., 0] = 200
-    sheet = memory_sheet(frames, np.array([[0, 0]]), grid=4, exec_start=1, step=2, title="x")
-    top = sheet.height - MARGIN - TILE - 32
-    inside = sheet.getpixel((MARGIN + TILE // 8, top + TILE // 8))
-    outside = sheet.getpixel((MARGIN + TILE * 7 // 8, top + TILE * 7 // 8))
-    assert inside == (200, 0, 0)
-    assert isinstance(outside, tuple)
-    assert len(set(outside)) == 1
-    assert outside[0] > 150
-
-
-def test_more_frames_than_fit_are_counted() -> None:
-    frames = np.zeros((80, 16, 16, 3), np.uint8)
-    selected = np.array([[frame, 0] for frame in range(80)])
-    assert memory_sheet(frames, selected, 2, 0, 79, "t" * 500).height < 2000
 
 
 def test_a_checkpoint_shows_its_parts(tmp_path: Path, console: Console) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from helpers.h5_files import write_file
-from mme_vla import cli
 from mme_vla.cli.errors import Terminated, print_user_errors
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
@@ -53,25 +52,6 @@ def test_a_signal_is_reported_though_a_finally_fails(
     assert "Stopped by" in capsys.readouterr().err
 
 
-def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sentence(monkeypatch, capsys) -> None:
-    def interrupted(name: str) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(cli, "import_module", interrupted)
-    with pytest.raises(SystemExit) as ended:
-        cli.run("train")
-    assert ended.value.code == 130
-    assert "Stopped by Ctrl-C" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("room", ["cli", "play", "nano", "envs", "serving", "subgoal"])
-def test_nothing_slow_is_imported_before_a_command_can_be_stopped(room: str) -> None:
-    """`python -m mme_vla.<room>…` imports the package first, and only then what turns signals into a sentence."""
-    script = f"import sys, mme_vla.{room}; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", script]).returncode == 0
-
-
 @pytest.mark.parametrize(
     ("error", "words"),
     [
@@ -100,20 +80,6 @@ def test_other_errors_keep_their_traceback() -> None:
     for error in (ValueError("errno = 28"), PermissionError(errno.EACCES, "a port"), OSError("strange")):
         with pytest.raises(type(error)), print_user_errors():
             raise error
-
-
-def test_an_error_of_writing_learns_its_place_from_the_lock(tmp_path: Path) -> None:
-    with pytest.raises(OSError) as caught, FolderLock(tmp_path / "run"):
-        raise OSError(errno.ENOSPC, "No space left on device")
-    assert caught.value.filename == str(tmp_path / "run")
-
-
-def test_a_released_lock_leaves_nothing_and_work_stays(tmp_path: Path) -> None:
-    FolderLock(tmp_path / "empty").acquire().release()
-    assert not (tmp_path / "empty").exists()
-    with FolderLock(tmp_path / "full"):
-        (tmp_path / "full" / "work").touch()
-    assert [path.name for path in (tmp_path / "full").iterdir()] == ["work"]
 
 
 @pytest.mark.slow
@@ -197,14 +163,3 @@ def test_a_finished_recording_is_recognised_and_others_are_not(tmp_path: Path) -
     with pytest.raises(UserError, match="not what this command records"):
         RecordingPlan([other], None, tmp_path).missing(PNG)
     assert RecordingPlan([job], tmp_path / "dataset", None).missing(PNG) == [tmp_path / "dataset"]
-
-
-def test_what_a_recording_left_that_was_killed_after_its_last_move_is_removed(tmp_path: Path) -> None:
-    dataset, work = tmp_path / "dataset", tmp_path / "dataset.partial"
-    dataset.mkdir()
-    assert claim_plan(work, {"a": 1})
-    (work / "episodes" / "one").mkdir(parents=True)
-    RecordingPlan([], dataset, None).tidy()
-    assert list(tmp_path.iterdir()) == [dataset]
-    with FolderLock(work), pytest.raises(UserError, match="in use by another conversion"):
-        RecordingPlan([], dataset, None).tidy()

@@ -9,7 +9,7 @@ import pytest
 
 from helpers import REPOSITORY, commands
 from mme_vla.cli.command import help_text
-from mme_vla.cli.help import COMMANDS, choices, defaults, keys, near_keys
+from mme_vla.cli.help import COMMANDS, choices, defaults, keys
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.errors import UserError
 
@@ -53,15 +53,6 @@ def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_help_under_a_choice_shows_its_keys() -> None:
-    text = ask("mme_vla.train", "--help", "model=framesamp_modul")
-    assert text.startswith("Usage: python -m mme_vla.train ")
-    assert "memory=framesamp\n" in text
-    assert re.search(r"integration.num_heads=4 +query heads", text)
-    assert "Did you mean 'framesamp_modul'" in ask("mme_vla.train", "--help", "model=framesamp_modl", code=2)
-
-
-@pytest.mark.slow
 def test_help_needs_no_torch() -> None:
     watch = "import sys, runpy; sys.argv = ['x', '--help']\n" \
             "try: runpy.run_module('mme_vla.train', run_name='__main__')\n" \
@@ -97,11 +88,3 @@ def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(
 def test_a_key_with_another_name_here_is_suggested(command: str, word: str, message: str) -> None:
     with pytest.raises(UserError, match=re.escape(message)):
         compose(command, [word])
-
-
-def test_near_keys_are_the_equal_ones_then_parts_then_like_ones() -> None:
-    paths = ["train", "train.steps", "max_steps", "seed"]
-    assert near_keys("steps", paths) == ["train.steps"]
-    assert near_keys("max", paths) == ["max_steps"]
-    assert near_keys("sed", paths) == ["seed"]
-    assert near_keys("zzz", paths) == []

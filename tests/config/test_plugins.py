@@ -16,7 +16,7 @@ from mme_vla.cli import analyse, inspect
 from mme_vla.cli.weights import convert
 from mme_vla.config import plugins
 from mme_vla.config.composition import compose, import_plugins
-from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD, imported_plugins, trust_as_flag, trust_as_override
+from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD
 from mme_vla.config.plugins import import_plugins as import_modules
 from mme_vla.envs import metadata
 from mme_vla.evaluation.rollout.evaluation import choose_episodes, evaluate
@@ -31,7 +31,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.base import PerceptualMemory
 from mme_vla.registry import MEMORIES
 
 
@@ -149,12 +149,6 @@ def test_what_constructors_compute_is_there_after_loading(foreign_run: Path) -> 
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_what_the_user_has_imported_needs_no_further_word(foreign_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import_modules([f"{OWN}.memory"])
-    MMEPolicy.from_pretrained(foreign_run / "checkpoint")
-    assert f"{OWN}.memory" in imported_plugins()
-
-
 @pytest.mark.parametrize("names", ["[1]", "{a: 1}", "['rm -rf']", "3", "['../x']"])
 def test_plugins_are_names_of_modules(names: str) -> None:
     from omegaconf import OmegaConf
@@ -171,14 +165,6 @@ def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(forei
     facts = RunFacts("fading", 1, 42, max_steps=3)
     records = evaluate(policy, choose_episodes("Stay", 1), tmp_path, facts, settings, show_progress=False).records
     assert [(r.task, r.outcome, r.steps) for r in records] == [("Stay", "timeout", 4)]
-
-
-def test_both_spellings_of_trust_reach_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert trust_as_override([TRUST_FLAG, "seed=1"]) == [TRUST_WORD, "seed=1"]
-    assert trust_as_flag([TRUST_WORD, "x"]) == [TRUST_FLAG, "x"]
-    for name in ("train", "cache", "evaluate", "serve", "inspect"):
-        assert compose(name, [TRUST_WORD]).trust_plugins is True, name
-        assert compose(name).trust_plugins is False, name
 
 
 def test_episodes_of_a_custom_task_have_separate_seeds(foreign_run: Path) -> None:

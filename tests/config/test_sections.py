@@ -81,18 +81,20 @@ def test_a_secret_is_not_reported() -> None:
     assert "5317" not in str(error.value)
 
 
-def test_keys_of_other_purposes_are_left_aside_only_where_they_may_be() -> None:
-    assert read_section(Inner, {"width": 1, "model": "x"}, others=True) == Inner(1)
-    with pytest.raises(UserError, match="Unknown key model"):
-        read_section(Inner, {"width": 1, "model": "x"})
-
-
 def test_commands_read_their_settings_with_it() -> None:
     with pytest.raises(UserError, match=r"train\.keep\.last='two' must be a whole number"):
         TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1, "keep": {"last": "two"}})
     with pytest.raises(UserError, match=r"Unknown key train\.kepe\. Did you mean 'keep'"):
         TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1, "kepe": {}})
-    with pytest.raises(UserError, match="render='no' must be true or false"):
-        RolloutSettings.from_config({"model": "x", "render": "no"})
+    for wrong, message in (
+        ({"render": "no"}, "render='no' must be true or false"), ({"workers": 0}, "workers=0"),
+        ({"max_steps": 1.5}, "max_steps=1.5"), ({"split": "tset"}, "tset"), ({"env": "robome"}, "env='robome'"),
+        ({"video": "some"}, "video='some'"), ({"timeout_s": 0}, "timeout_s=0"), ({"draw": "need"}, "'needed'"),
+        ({"env": "official", "render": False}, "env=official"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=message):
+            RolloutSettings.from_config({"model": "x", **wrong})
+    with pytest.raises(UserError, match="MME_VLA_API_KEY"):
+        ServeSettings.from_dict({"host": "0.0.0.0", "require_key": True, "api_key": ""})
     with pytest.raises(UserError, match=r"Unknown key limits\.frame\. Did you mean 'frames'"):
         ServeSettings.from_dict({"limits": {"frame": 3}})

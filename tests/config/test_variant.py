@@ -47,14 +47,6 @@ def test_a_composition_is_called_what_it_is(words: list[str], name: str) -> None
     assert name_of(*words) == name
 
 
-def test_many_differences_become_a_digest_that_depends_on_all_of_them() -> None:
-    words = ["model=ttt_modul", "memory.base_rate=0.02", "memory.max_rate=0.2", "memory.max_grad_norm=4.0"]
-    name, other = name_of(*words), name_of(*words[:-1], "memory.max_grad_norm=3.0")
-    assert name.startswith("ttt_modul-")
-    assert len(name) == len("ttt_modul-") + 6
-    assert name == name_of(*words) != other
-
-
 @pytest.fixture
 def config_folder(tmp_path: Path) -> Path:
     for file, text in OWN.items():
@@ -92,11 +84,6 @@ def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path
         ("framesamp_modul", "0_framesamp_modul"),
         ("tokendrop_modul", "1_tokendrop_modul"),
     ], done.stderr
-
-
-def test_from_python_the_policy_and_its_card_have_the_true_name(tmp_path: Path) -> None:
-    policy = build_policy("tokendrop_expert", memory="framesamp", integration="modulator", device="meta")
-    assert policy.config["name"] == "framesamp_modul"
 
 
 def test_the_digest_tells_compositions_apart_and_nothing_else() -> None:

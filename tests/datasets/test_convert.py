@@ -1,7 +1,6 @@
 """HDF5 → LeRobot, resumable."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +51,9 @@ def test_png_conversion_is_exact(tmp_path: Path, recorded) -> None:
     refs, episodes = recorded
     assert convert(refs, tmp_path / "out", PNG) == 3
     check(EpisodeSource(tmp_path / "out"), episodes, tolerance=0)
+    assert EpisodeSource(tmp_path / "out").verify() > 5
+    stats = json.loads((tmp_path / "out" / "meta" / "stats.json").read_text())
+    assert list(stats) == sorted(stats), "an order of a set would differ between processes"
     assert not (tmp_path / "out.partial").exists()
 
 
@@ -78,27 +80,6 @@ def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(video
     check(source, episodes, tolerance=3)
     frames = source.frames(0, np.arange(12))
     assert np.array_equal(frames[:, :, 8:], np.repeat(frames[:1, :, 8:], 12, axis=0))
-
-
-def test_a_conversion_says_what_is_done_and_nothing_of_what_the_libraries_do(tmp_path: Path, recorded, capfd) -> None:
-    episodes, _ = recorded
-    convert(episodes, tmp_path / "out", ConvertOptions())
-    out, stderr = capfd.readouterr()
-    assert out == ""
-    assert [line.partition(":")[0] for line in stderr.splitlines()] == ["read", "convert"], stderr
-    assert f"{len(episodes)} of {len(episodes)} episodes" in stderr
-
-
-def test_a_flipped_bit_in_a_converted_dataset_is_detected(tmp_path: Path, video_dataset) -> None:
-    shutil.copytree(video_dataset[0], tmp_path / "out")
-    assert EpisodeSource(tmp_path / "out").verify() > 5
-    for pattern in ("data/**/*.parquet", "videos/**/*.mp4"):
-        file = next((tmp_path / "out").glob(pattern))
-        content = file.read_bytes()
-        file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
-        with pytest.raises(UserError, match=f"{file.name} is damaged"):
-            EpisodeSource(tmp_path / "out").verify()
-        file.write_bytes(content)
 
 
 def test_an_interrupted_conversion_continues_with_the_missing_episodes(tmp_path: Path, recorded, monkeypatch) -> None:
@@ -163,8 +144,3 @@ def test_a_finished_conversion_is_recognised_and_nothing_foreign_is_overwritten(
     (partial / "plan.json").write_text(json.dumps({"options": {}, "episodes": []}))
     with pytest.raises(UserError, match="belongs to another conversion"):
         convert(refs, tmp_path / "new", PNG)
-
-
-def test_impossible_options_are_refused() -> None:
-    with pytest.raises(UserError, match="expected 'video' or 'png'"):
-        ConvertOptions(images="gif")

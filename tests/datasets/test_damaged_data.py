@@ -70,12 +70,6 @@ def test_damaged_tables_are_reported_on_opening(copy, file, name, edit, kind, me
         EpisodeSource(copy)
 
 
-def test_empty_table_of_episodes_is_reported(copy: Path) -> None:
-    pq.write_table(pq.ParquetFile(copy / EPISODES).read().slice(0, 0), copy / EPISODES)
-    with pytest.raises(UserError, match="describes 0 episodes"):
-        EpisodeSource(copy)
-
-
 def test_what_stands_in_a_files_place_is_reported_without_waiting_and_without_the_hub(copy: Path) -> None:
     (copy / EPISODES).unlink()
     os.mkfifo(copy / EPISODES)
@@ -126,19 +120,6 @@ def test_a_flipped_bit_in_cached_tokens_is_detected_when_the_episode_is_first_re
     vision.history(0)
     with pytest.raises(UserError, match=r"episode_000001.npy is damaged.*rebuild=true"):
         vision.history(1)
-
-
-def test_each_process_compares_an_episode_once(cache: Path, monkeypatch) -> None:
-    from mme_vla.utils import checksums
-
-    paths: list[Path] = []
-    real = checksums.file_sum
-    monkeypatch.setattr(checksums, "file_sum", lambda path: paths.append(path) or real(path))
-    vision = opened(cache)
-    vision.max_open = 1
-    for episode in (0, 1, 0, 1):
-        vision.history(episode)
-    assert len(paths) == 4  # tokens and scores of two episodes
 
 
 def test_a_cache_without_sums_still_opens(cache: Path) -> None:

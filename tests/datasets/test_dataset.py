@@ -140,11 +140,6 @@ def test_workers_give_the_same_batches_as_the_main_process(data, processor, cach
     assert batch.state.shape == (8, 8) and batch.prompt.shape == batch.prompt_mask.shape == (8, 16)
 
 
-def test_without_options_a_batch_has_no_history_and_no_action_mask(data, processor) -> None:
-    batch = collate([TrainingDataset(data[0], processor)[0]])
-    assert batch.history is None and batch.action_mask is None
-
-
 def test_an_item_decodes_its_two_current_images_only(data, processor, caches, monkeypatch) -> None:
     requests = []
     frames = EpisodeSource.frames

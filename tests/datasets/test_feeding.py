@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.trainings import RECIPE, policy
+from helpers.trainings import policy
 from mme_vla.config.composition import compose
 from mme_vla.data.cache_building import PAGE, ahead, save_aligned
 from mme_vla.errors import UserError
 from mme_vla.memory.history import FrameScores
 from mme_vla.memory.tokendrop import FIRST_FRAME_SCORE, THRESHOLD, ranked_patches
 from mme_vla.policy.finetune import apply_finetuning, cast_frozen
-from mme_vla.speed.recompute import SAVED_OPS, checkpoint_options
-from mme_vla.training.order import readers, size_of
-from mme_vla.training.settings import TrainSettings
+from mme_vla.speed import SAVED_OPS
+from mme_vla.training.order import readers
 from mme_vla.utils import files_to_hold
 
 
@@ -27,13 +26,6 @@ def test_reading_ahead_is_bounded_in_bytes() -> None:
     assert readers(8, 10**9, 5e9) == (5, 1)  # fewer read
     assert readers(8, 10**12, 8e9) == (1, 1)  # one batch there must be
     assert readers(0, 10**6, 8e9) == (0, 0)
-
-
-def test_a_samples_size_counts_all_its_tensors() -> None:
-    item = {"images": torch.zeros(2, 3, dtype=torch.uint8), "goal": "words", "place": (0, 1, 2),
-            "history": type("History", (), {})()}  # fmt: skip
-    item["history"].features = torch.zeros(4, dtype=torch.float32)
-    assert size_of(item) == 6 + 16
 
 
 def test_things_are_made_ahead_and_no_further() -> None:
@@ -138,16 +130,6 @@ def _products(how: bool | str) -> int:
     with Count() as count:
         built(built.full_batch(), draws)[0].backward()
     return count.n_products
-
-
-def test_recomputation_is_requested_in_words() -> None:
-    assert TrainSettings.from_dict(RECIPE).recomputation is False
-    options = {**RECIPE, "gradient_checkpointing": True}
-    assert TrainSettings.from_dict(options).recomputation is True
-    assert TrainSettings.from_dict({**options, "recompute": "selective"}).recomputation == "selective"
-    with pytest.raises(UserError, match=r"train\.recompute='most' must be all or selective"):
-        TrainSettings.from_dict({**RECIPE, "recompute": "most"})
-    assert "context_fn" not in checkpoint_options(True)
 
 
 def test_what_does_not_learn_may_be_stored_in_bfloat16() -> None:

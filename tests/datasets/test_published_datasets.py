@@ -109,14 +109,6 @@ def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, recording
     np.testing.assert_array_equal(source.frames(2, range(9), "wrist"), converted.frames(2, range(9), "wrist"))
 
 
-def test_columns_of_subtasks_are_left_alone(tmp_path: Path, recordings: Path) -> None:
-    root = publish(tmp_path / "subtasks", recordings, "image", {"subtask_index": SUBTASK}, order=(1,))
-    (tmp_path / "starts.json").write_text('{"0": 0}')
-    source = EpisodeSource(root, exec_starts=tmp_path / "starts.json")
-    assert source.subgoals(0, 2)["simple_subgoal"] == "pick up 0"
-    assert source.subgoal_names == ("simple_subgoal",)
-
-
 def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_named(
     tmp_path: Path, recordings: Path
 ) -> None:

@@ -7,13 +7,7 @@ import pytest
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, RawEpisode, open_episode
-from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.sample import EPISODES
-
-
-def test_the_sample_is_small_and_documented() -> None:
-    assert sum(file.stat().st_size for file in SAMPLE.rglob("*") if file.is_file()) < 6_000_000
-    assert "Stale images" in (SAMPLE / "README.md").read_text()
 
 
 def test_the_sample_holds_four_real_demonstrations() -> None:

@@ -15,7 +15,6 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
 from mme_vla.processing.processor import Processor
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
-from mme_vla.training import runs
 from mme_vla.utils import SUMS
 
 SHIPPED = sorted(path.stem for path in (config_dir() / "embodiment").glob("*.yaml"))
@@ -101,20 +100,6 @@ def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_pat
     assert loaded.embodiment == ROBOMME_JOINT and "embodiment" not in loaded.config
     batch, noise = random_batch(policy), torch.zeros(2, 20, 32)
     assert torch.equal(loaded.sample_actions(batch, noise, 2), policy.sample_actions(batch, noise, 2))
-
-
-def test_a_run_begun_before_robots_could_be_selected_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    config: Any = OmegaConf.to_container(compose("train", [f"output={tmp_path}"]), resolve=True)
-    old = {key: value for key, value in config.items() if key != "embodiment"}
-    checkpoint = tmp_path / "checkpoints" / "step_000001"
-    monkeypatch.setattr(runs, "resolve_checkpoint", lambda path: checkpoint)
-    monkeypatch.setattr(runs, "read_state", lambda path: {"config": old, "step": 1})
-    assert runs.open_run(tmp_path, str(checkpoint), config).step == 1
-    other: Any = OmegaConf.to_container(
-        compose("train", [f"output={tmp_path}", "embodiment=robomme_joint_absolute"]), resolve=True
-    )
-    with pytest.raises(UserError, match=r"embodiment\.action\.relative"):
-        runs.open_run(tmp_path, str(checkpoint), other)
 
 
 def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.data.lerobot_files import check_vectors, find_columns
+from mme_vla.data.lerobot_files import check_vectors
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.policy.saving import composition_digest
 from mme_vla.testing.small import SMALL_VISION, unit_stats
@@ -38,13 +38,6 @@ def test_the_robot_tells_compositions_apart_and_the_panda_goes_without_saying() 
     assert composition_digest({**config, "embodiment": ROBOMME_JOINT.to_dict()}) == digest
     absolute = {**ROBOMME_JOINT.to_dict(), "action": {**ROBOMME_JOINT.action.to_dict(), "relative": []}}
     assert composition_digest({**config, "embodiment": absolute}) != digest
-
-
-def test_a_camera_is_a_column_of_images(tmp_path: Path) -> None:
-    numbers = {"dtype": "float32", "shape": (8,)}
-    features = {"image": numbers, "wrist_image": {"dtype": "video", "shape": (8, 8, 3)}, "state": numbers}
-    with pytest.raises(UserError, match=r"image holds 'float32', no images.*cameras\.front\.key"):
-        find_columns(tmp_path, {**features, "actions": numbers}, ROBOMME_JOINT)
 
 
 def test_a_single_number_may_stand_without_a_list_and_is_checked_all_the_same(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 """Each of the 17 models trains on the embedded sample as `python -m mme_vla.train` does; recurrent ones resume."""
 
 import time
-from collections.abc import Iterator, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +11,8 @@ from omegaconf import OmegaConf
 
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
-from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.sources import open_sources
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
-from mme_vla.training import data as training_data
 from mme_vla.training.logging import read_metrics
 
 pytestmark = pytest.mark.slow
@@ -42,30 +37,6 @@ SHORT_MEMORY = {
     "learned_topk": ["memory.budget=48", "memory.pool=4"],
     "spacetime": ["memory.frames=3", "memory.stride=4", "memory.state_dim=8"],
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def opened_once() -> Iterator[None]:
-    """Every run reads the same steps of the same files: open the sample once, and decode each image once."""
-    sources = open_sources(["sample"])
-    for source in sources:
-        _keep_images(source)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_data, "open_sources", lambda names, robot: sources)
-        yield
-
-
-def _keep_images(source: EpisodeSource) -> None:
-    decode = source.frames
-
-    @cache
-    def image(episode: int, index: int, camera: str | None) -> np.ndarray:
-        return decode(episode, [index], camera)
-
-    def frames(episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        return image(episode, int(indices[0]), camera) if len(indices) == 1 else decode(episode, indices, camera)
-
-    source.frames = frames  # type: ignore[method-assign]
 
 
 @pytest.fixture(scope="module")

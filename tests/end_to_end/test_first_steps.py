@@ -7,11 +7,9 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
-from helpers import REPOSITORY
-from mme_vla import Memory, cli
+from mme_vla import cli
 from mme_vla.cli import train as train_command
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
@@ -20,8 +18,6 @@ from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import Table, print_table
 from mme_vla.policy.run_folders import find_run, resolve_checkpoint
-from mme_vla.testing.small import small_policy
-from mme_vla.training.loop import worse_than_still
 from mme_vla.training.runs import weights_to_start_from
 
 
@@ -47,27 +43,6 @@ def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
     assert weights_to_start_from(compose("train", []).init_from) is None
 
 
-def test_a_run_that_is_worse_than_holding_still_says_why() -> None:
-    summary = {"names": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
-    assert worse_than_still(summary, 350).startswith(
-        "1 of 2 numbers of the action are predicted worse than by holding still"
-    )
-    assert "350 updates" in worse_than_still(summary, 350)
-    assert worse_than_still({**summary, "mean_abs_error": [0.05, 0.1]}, 350) == ""
-
-
-def test_one_episode_acts_as_it_does_in_a_list() -> None:
-    policy = small_policy("pi05")
-    frame, state = np.full((1, 256, 256, 3), 90, np.uint8), np.zeros((1, 8), np.float32)
-    chunks = []
-    for alone in (True, False):
-        episode = policy.start_episode("pick up the red cube", seed=3)
-        episode.observe({"front": frame, "wrist": frame}, state)
-        chunks.append(policy.act(episode) if alone else policy.act([episode])[0])
-    assert chunks[0].ndim == 2
-    np.testing.assert_array_equal(*chunks)
-
-
 @pytest.mark.parametrize("won", [False, True])
 def test_the_average_of_nothing_but_failures_has_an_interval(won: bool) -> None:
     outcome = "success" if won else "fail"
@@ -88,19 +63,6 @@ def test_a_narrow_terminal_cuts_no_number(capsys: pytest.CaptureFixture[str]) ->
     printed = capsys.readouterr().out
     assert printed.count("64.94 ± 1.99") == 8
     assert "framesamp_modul" in printed
-
-
-def test_the_demonstration_takes_custom_memories_and_always_shows_the_one_without(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.syspath_prepend(REPOSITORY / "examples")
-    import memory_matters
-
-    assert memory_matters.models_of(["mine"]) == ["mine", "pi05"]
-    assert memory_matters.models_of(["pi05", "ttt_modul"]) == ["pi05", "ttt_modul"]
-    monkeypatch.chdir(REPOSITORY / "examples" / "last_frames")
-    learned = memory_matters.learn("last_frames_context", steps=1, episodes=2, config_dir=Path("configs"))
-    assert (learned["model"], learned["steps"]) == ("last_frames_context", 1)
 
 
 class _Terminal(io.StringIO):
@@ -149,25 +111,3 @@ def test_a_refused_run_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(UserError, match="device=cuda"):
         train_command.main(compose("train", ["train.device=cuda", f"output={folder}"]))
     assert not folder.exists()
-
-
-def test_arguments_for_the_constructor_of_memory_are_explained() -> None:
-    class Own(Memory):
-        def __init__(self) -> None:
-            super().__init__(32, 48)
-
-    with pytest.raises(TypeError, match=r"Own: MemoryModule.__init__\(\) takes no arguments.*self.budget"):
-        Own()
-
-
-def test_what_the_tutorials_write_is_ignored_by_git() -> None:
-    if not (REPOSITORY / ".git").exists():
-        pytest.skip("no clone")
-    saved = ("outputs/x", "examples/last_frames/outputs/x", "examples/two_buttons/data/x", "gallery/x", "runs/x")
-    for path in saved:
-        assert subprocess.run(["git", "check-ignore", "-q", path], cwd=REPOSITORY).returncode == 0, path
-
-
-def test_pages_have_no_placeholder_that_a_shell_takes_for_a_redirection() -> None:
-    for page in (REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md")):
-        assert "<time>" not in page.read_text(), page

@@ -10,13 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.h5_files import write_file
 from helpers.plugins import plugin
 from mme_vla import Policy
-from mme_vla.data.convert import ConvertOptions, convert
-from mme_vla.data.dataset import TrainingDataset
-from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.errors import UserError
 from mme_vla.testing.small import small_policy
@@ -190,38 +185,3 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
     policy.reset()
     exact = policy.predict_action_chunk(batch, inference_delay=4, prev_chunk_left_over=left)
     assert torch.equal(bound, exact)
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"observation.state": None}, "needs the feature 'observation.state' of 8 numbers; there is none"),
-        ({"observation.images.image": None}, "No images of the camera 'front'"),
-    ],
-)
-def test_what_a_dataset_lacks_is_named(
-    package: ModuleType, our_folder: Path, changed: dict[str, None], message: str
-) -> None:
-    from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
-
-    policy = Policy.from_pretrained(our_folder)
-    images, numbers = package.convert.features_of(policy.embodiment)
-    features = {name: feature for name, feature in images.items() if name not in changed}
-    config = package.MMEVLAConfig(device="cpu", input_features=features, output_features=numbers)
-    with pytest.raises(UserError, match=message):
-        MMEVLAPolicy(config, model=policy)
-
-
-def test_every_row_of_a_dataset_has_its_step(tmp_path: Path) -> None:
-    write_file(tmp_path / "record_dataset_Alpha.h5", [12, 9], videos=[5, 0])
-    convert(list_episodes(find_files([tmp_path])), tmp_path / "out", ConvertOptions(images="png"))
-    source = EpisodeSource(tmp_path / "out")
-    policy = small_policy("pi05")
-    steps = TrainingDataset([source], policy.require_processor())
-    assert [source.locate(row) for row in (0, 11, 12, 20)] == [(0, 0), (0, 11), (1, 0), (1, 8)]
-    places = [steps.locate(steps.item_at(0, *source.locate(row))) for row in range(21)]
-    assert places[5:12] == [(0, 0, frame) for frame in range(5, 12)]
-    assert places[12:] == [(0, 1, frame) for frame in range(9)]
-    assert {place[1] for place in places[:5]} == {0} and len(set(places[:5])) > 1  # the video's rows are spread
-    with pytest.raises(IndexError):
-        source.locate(21)

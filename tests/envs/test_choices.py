@@ -1,7 +1,6 @@
 """A robot that chooses among options: its numbers, its data, training, rollouts and serving, and real recordings."""
 
 import json
-import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,11 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
-from helpers.h5_files import OPTIONS, choice_at, write_file
+from helpers.h5_files import OPTIONS, choice_at, robomme_robot, write_file
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
 from helpers.serving_fakes import Served, challenge
-from mme_vla import MMEPolicy, UserError
-from mme_vla.cli.train import train
-from mme_vla.config.composition import compose
+from mme_vla import UserError
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
@@ -28,19 +24,13 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option, read_options
 from mme_vla.embodiment.robomme import benchmark_action, choice_row
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 
 EIGHT = [{"label": letter, "action": "move", "need_parameter": False} for letter in "abcdefgh"]
 
 
-def robot() -> Embodiment:
-    section: Any = OmegaConf.to_container(compose("policy", ["embodiment=robomme_choice"]).embodiment, resolve=True)
-    return Embodiment.from_dict(section)
-
-
-CHOOSER = robot()
+CHOOSER = robomme_robot("robomme_choice")
 SPACE = CHOOSER.action
 
 
@@ -79,8 +69,7 @@ def test_the_best_of_the_offered_letters_is_taken_and_no_other() -> None:
 
 
 def test_other_robots_decide_nothing_and_say_nothing_of_options() -> None:
-    section: Any = OmegaConf.to_container(compose("policy", []).embodiment, resolve=True)
-    joints = Embodiment.from_dict(section).action
+    joints = robomme_robot("robomme_joint").action
     actions = torch.randn(3, 8)
     assert joints.decide(actions, ()) is actions and joints.worded("go", ()) == "go"
     assert "choice" not in joints.to_dict(), "configurations of earlier versions stay what they were"
@@ -177,15 +166,6 @@ def test_the_longest_options_of_the_benchmark_fit_the_prompt() -> None:
     assert mask.sum() < processor.longest_prompt
 
 
-def test_files_without_choices_convert_as_before(tmp_path: Path) -> None:
-    write_file(tmp_path / "record_dataset_Alpha.h5", [8], choices=True)
-    write_file(tmp_path / "record_dataset_Beta.h5", [8])
-    convert(list_episodes(find_files([tmp_path])), tmp_path / "out", ConvertOptions(images="png"))
-    assert "options" not in EpisodeSource(tmp_path / "out").records[0]
-    with pytest.raises(UserError, match="lacks the feature choice_actions"):
-        EpisodeSource(tmp_path / "out", robot=CHOOSER)
-
-
 def test_a_dataset_that_lost_its_options_says_so(folder: Path) -> None:
     source = EpisodeSource(folder, robot=CHOOSER)
     source.__dict__["records"] = [{key: v for key, v in r.items() if key != "options"} for r in source.records]
@@ -217,22 +197,6 @@ def test_a_damaged_choice_is_reported_with_its_place(tmp_path: Path) -> None:
 
 
 # Training, rollouts, serving ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("model", ["framesamp_modul", "simplesg"])
-def test_a_policy_of_choices_trains_and_keeps_its_robot(folder: Path, tmp_path: Path, model: str) -> None:
-    words = [
-        f"model={model}", "embodiment=robomme_choice", f"data.sources=[{folder}]",
-        "data.val_episodes=[1]", f"data.cache.root={tmp_path / 'caches'}", "backbone.depth=1",
-        "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "logger=none",
-        "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=2",
-        "train.open_loop_chunks=1", *(["memory.budget=64"] if "framesamp" in model else []),
-    ]  # fmt: skip
-    cfg = compose("train", words)
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    policy = MMEPolicy.from_pretrained(train(cfg, config, tmp_path / "run", begun=time.perf_counter()))
-    assert policy.embodiment == CHOOSER
-    assert policy.require_processor().require_stats().actions.q99[:8].tolist() == [1] * 8
 
 
 class ChoiceEnvs(InlineEnvs):
@@ -323,18 +287,3 @@ def test_choices_of_real_episodes_are_those_of_the_official_files(h5_folder: Pat
             counts[task] = (motions.decisions.tolist(), [c["choice"] for c in actions], [c["point"] for c in actions])
     assert counts["PickXtimes"] == ([0, 143, 237], ["A", "B", "C"], [[54, 145], [93, 109], [66, 101]])
     assert counts["PatternLock"][:2] == ([74, 109], ["A", "H"])
-
-
-@pytest.mark.parametrize(("task", "number"), [("PickXtimes", 8), ("PatternLock", 8)])
-def test_recorded_choices_of_a_real_episode_succeed_in_the_environment(h5_folder: Path, task: str, number: int) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    with open_episode(EpisodeRef(h5_folder / f"record_dataset_{task}.h5", number, task)) as episode:
-        actions = find_choices(episode.choice_actions()[episode.exec_start :], 0, SPACE.choice).targets
-        options = episode.options
-    env = make_rollout_env(task, "train", number, robot=CHOOSER, action_space=SPACE.space, render=False)
-    _, info = env.reset()
-    assert info["available_multi_choices"] == options
-    frames, _, terminated, _, report = env.step({"actions": actions})
-    env.close()
-    assert terminated and report["status"] == "success" and report["executed"] == len(actions)
-    assert len(frames["state"]) == report["steps"] > report["executed"]

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import steps_of_demonstration
+from helpers.env_tasks import steps_of_demonstration
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.subtasks import Progress, SubTask

@@ -15,7 +15,7 @@ from mme_vla.errors import UserError
 @pytest.fixture(autouse=True)
 def _shipped_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(metadata.FOLDER_VARIABLE, raising=False)
-    monkeypatch.setattr(metadata, "_installed_folder", lambda: None)
+    monkeypatch.setattr(metadata, "find_spec", lambda name: None)
 
 
 @pytest.mark.parametrize(("split", "count"), [("train", 1600), ("val", 800), ("test", 800)])

@@ -1,19 +1,15 @@
 """MoveCube: layout of video and execution, the three manners, and what fails in each."""
 
-from collections.abc import Callable, Iterator
-
 import numpy as np
 import pytest
 import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import read_cube, read_disc, steps_of_demonstration
-from helpers.env_unmask import make, texts, wait
+from helpers.env_tasks import go_to, make, read_cube, read_disc, steps_of_demonstration, wait
 from mme_vla.envs.scene.objects import H
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.things import Thing, distance_xy
-from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.envs.tasks.move_cube import MANNERS, MoveCube
 
 HOOK, PUSH, GRASP = 5, 3, 0  # seeds
@@ -22,23 +18,9 @@ PUSH_CUBE = "Close the gripper and push the cube to the target"
 PICK_CUBE, PLACE_CUBE = "Pick up the cube", "place the cube onto the target"
 
 
-@pytest.fixture(scope="module")
-def tasks() -> Iterator[Callable[[int], MoveCube]]:
-    made: dict[int, MoveCube] = {}
-
-    def of(seed: int) -> MoveCube:
-        made.setdefault(seed, make(MoveCube, seed, "easy")).reset()
-        return made[seed]
-
-    yield of
-    for env in made.values():
-        env.close()
-
-
 def begin(env: MoveCube, monkeypatch: pytest.MonkeyPatch, text: str) -> list[Thing]:
     """Go to a sub-task of the execution with nothing in the hand; what is put into the list is held."""
-    steps = env.progress.subtasks
-    env.progress.index = next(i for i, step in enumerate(steps) if step.text == text and not step.video)
+    go_to(env, text)
     in_hand: list[Thing] = []
     monkeypatch.setattr(env, "is_grasping", lambda thing: thing in in_hand)
     return in_hand
@@ -74,8 +56,7 @@ def skip_centre(stream: Draws, goal: np.ndarray) -> Region:
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5])
 @pytest.mark.parametrize("difficulty", ["easy", "hard"])
 def test_video_and_execution_come_from_the_stream_in_order(seed, difficulty):
-    env = make(MoveCube, seed, difficulty)
-    stream = Draws(seed)
+    env, stream = make(MoveCube, seed, difficulty), Draws(seed)
     stream.uniform(), stream.uniform()
     pegs = [read_peg(stream) for _ in range(2)]
     stream.integer(0, 2), stream.integer(0, 2)
@@ -97,27 +78,8 @@ def test_video_and_execution_come_from_the_stream_in_order(seed, difficulty):
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("seed", "expected"),
-    [
-        (HOOK, [(PICK_PEG, f"{PICK_PEG} at <>", "a"),
-                (HOOK_CUBE, "Hook the cube at <> to the target at <> with the peg", "b")]),
-        (PUSH, [(PUSH_CUBE, "Close the gripper and push the cube at <> to the target at <>", "c")]),
-        (GRASP, [(PICK_CUBE, f"{PICK_CUBE} at <>", "d"), (PLACE_CUBE, f"{PLACE_CUBE} at <>", "e")]),
-    ],
-)  # fmt: skip
-def test_the_execution_says_what_the_video_says(tasks, seed, expected):
-    env = tasks(seed)
-    assert texts(env) == [*expected, ("static",) * 2 + ("",), (NO_RECORD,) * 2 + ("",), *expected]
-    assert [step.video for step in env.progress.subtasks] == [True] * (len(expected) + 2) + [False] * len(expected)
-    assert env.goals() == [
-        f"watch the video carefully, then move the cube to the target in the same manner {end}"
-        for end in ("as before", "shown in the video")
-    ]
-
-
-def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(tasks, monkeypatch):
-    env = tasks(HOOK)
+def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(build_task, monkeypatch):
+    env = build_task(MoveCube, HOOK, "easy")
     in_hand = begin(env, monkeypatch, PICK_PEG)
     assert lift(env, in_hand, env.peg, [env.peg.tail]) == (False, False) and env.progress.index == 5
     put(env.cube, env.target.position, aside=0.055)
@@ -126,8 +88,8 @@ def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(tasks, monke
     assert wait(env) == (True, False)
 
 
-def test_pushing_counts_once_the_gripper_opens(tasks, monkeypatch):
-    env = tasks(PUSH)
+def test_pushing_counts_once_the_gripper_opens(build_task, monkeypatch):
+    env = build_task(MoveCube, PUSH, "easy")
     begin(env, monkeypatch, PUSH_CUBE)
     closed = np.append(env.reset_action[:7], -1).astype(np.float32)
     for _ in range(5):
@@ -138,8 +100,8 @@ def test_pushing_counts_once_the_gripper_opens(tasks, monkeypatch):
     assert wait(env, 5) == (True, False)
 
 
-def test_grasping_and_placing_is_success(tasks, monkeypatch):
-    env = tasks(GRASP)
+def test_grasping_and_placing_is_success(build_task, monkeypatch):
+    env = build_task(MoveCube, GRASP, "easy")
     in_hand = begin(env, monkeypatch, PICK_CUBE)
     assert lift(env, in_hand, env.cube, [env.cube]) == (False, False) and env.progress.index == 5
     put(env.cube, env.target.position, aside=0.04)
@@ -152,28 +114,28 @@ def test_grasping_and_placing_is_success(tasks, monkeypatch):
     ("seed", "text", "wrong"),
     [(HOOK, PICK_PEG, "cube"), (PUSH, PUSH_CUBE, "cube"), (PUSH, PUSH_CUBE, "peg"), (GRASP, PICK_CUBE, "peg")],
 )
-def test_another_thing_in_the_hand_fails(tasks, monkeypatch, seed, text, wrong):
-    env = tasks(seed)
+def test_another_thing_in_the_hand_fails(build_task, monkeypatch, seed, text, wrong):
+    env = build_task(MoveCube, seed, "easy")
     in_hand = begin(env, monkeypatch, text)
     thing = getattr(env, wrong)
     assert lift(env, in_hand, thing, [thing] if wrong == "cube" else [env.peg.head]) == (False, True)
 
 
 @pytest.mark.parametrize(("seed", "text"), [(HOOK, PICK_PEG), (GRASP, PICK_CUBE)])
-def test_the_cube_on_the_target_too_early_fails(tasks, monkeypatch, seed, text):
-    env = tasks(seed)
+def test_the_cube_on_the_target_too_early_fails(build_task, monkeypatch, seed, text):
+    env = build_task(MoveCube, seed, "easy")
     begin(env, monkeypatch, text)
     put(env.cube, env.target.position, aside=0.04)
     assert wait(env) == (False, True)
 
 
 @pytest.mark.parametrize(("seed", "text", "thing"), [(HOOK, HOOK_CUBE, "cube"), (GRASP, PLACE_CUBE, "peg")])
-def test_in_the_last_stage_nothing_fails(tasks, monkeypatch, seed, text, thing):
-    env = tasks(seed)
+def test_in_the_last_stage_nothing_fails(build_task, monkeypatch, seed, text, thing):
+    env = build_task(MoveCube, seed, "easy")
     in_hand = begin(env, monkeypatch, text)
     assert lift(env, in_hand, getattr(env, thing), [env.cube, env.peg.head]) == (False, False)
 
 
 @pytest.mark.parametrize("seed", [HOOK, PUSH])
-def test_hook_and_push_are_demonstrated(tasks, seed):
-    assert steps_of_demonstration(tasks(seed)) is not None
+def test_hook_and_push_are_demonstrated(build_task, seed):
+    assert steps_of_demonstration(build_task(MoveCube, seed, "easy")) is not None

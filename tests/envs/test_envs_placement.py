@@ -20,7 +20,6 @@ from mme_vla.envs.scene.placement import (
     SceneError,
     board_boxes,
     button_box,
-    draw_button,
     draw_container,
     draw_cube,
     draw_disc,
@@ -107,24 +106,6 @@ def test_what_cannot_be_touched_is_no_obstacle(scene):
     assert draw_cube(Draws(3), REGION, [named(scene, "target")]) is not None
 
 
-@pytest.mark.parametrize("seed", [0, 1800])
-def test_a_cube_takes_three_draws_a_trial_and_keeps_inside(seed):
-    x, y, share = stream(seed, 3)
-    xy, yaw = draw_cube(Draws(seed), REGION)
-    assert xy == pytest.approx([-0.3 + H + x * 0.36, -0.2 + H + y * 0.36], abs=1e-12)
-    assert yaw == 2 * np.pi * share
-
-
-def test_a_rejected_cube_is_sampled_again_from_the_following_numbers():
-    left = Box2D.aligned((-0.2, 0), (0.1, 1))
-    trials = [stream(0, 30)[i : i + 3] for i in range(0, 30, 3)]
-    squares = [Box2D.square(np.array([-0.28 + 0.36 * u, -0.18 + 0.36 * v]), 0.03, 2 * np.pi * w) for u, v, w in trials]
-    first = next(i for i, square in enumerate(squares) if not square.intersects(left))
-    xy, yaw = draw_cube(Draws(0), REGION, [left], gap=0.01)
-    assert first > 0, "the first trial is to be rejected in this test"
-    assert xy == pytest.approx(squares[first].centre) and yaw == pytest.approx(2 * np.pi * trials[first][2])
-
-
 @pytest.mark.parametrize(
     ("draw", "per_trial"),
     [
@@ -156,20 +137,3 @@ def test_a_container_counts_the_gap_twice_for_objects_but_once_for_ready_made_bo
     from_box = [draw_container(Draws(s), REGION, [box], gap=0.04)[0] for s in range(200)]
     assert min(box.grown(0.04).distance(xy) for xy in from_thing) >= CONTAINER_HALF + 0.04
     assert CONTAINER_HALF + 0.04 <= min(box.distance(xy) for xy in from_box) < CONTAINER_HALF + 0.045
-
-
-def test_a_containers_yaw_is_sampled_after_its_place():
-    x, y, share = stream(9, 3)
-    xy, yaw = draw_container(Draws(9), Region((0, 0), 0.2))
-    assert xy == pytest.approx([-0.1725 + x * 0.345, -0.1725 + y * 0.345])
-    assert yaw == pytest.approx(share * np.pi / 2)
-
-
-def test_a_buttons_offset_is_one_draw_of_two_numbers():
-    u = torch.rand(2, generator=torch.Generator().manual_seed(11)).numpy()
-    assert draw_button(Draws(11), (-0.2, 0.1)) == pytest.approx([-0.2 + (u[0] - 0.5) * 0.1, 0.1 + (u[1] - 0.5) * 0.4])
-
-
-def test_a_rectangle_may_have_two_widths():
-    places = np.array([draw_cube(Draws(s), Region((-0.1, 0), (0.05, 0.3)))[0] for s in range(50)])
-    assert np.abs(places[:, 0] + 0.1).max() <= 0.03 and 0.2 < np.abs(places[:, 1]).max() <= 0.28

@@ -17,7 +17,6 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 from mme_vla.utils.media import GAP, MARGIN, TILE
 
@@ -25,16 +24,11 @@ SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, r
 ONE_OF_EACH_SUITE = {"StopCube": "easy", "VideoUnmask": "easy", "PickHighlight": "easy", "RouteStick": "easy"}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def renderer() -> None:
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+pytestmark = pytest.mark.usefixtures("renderer")
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def recorded(renderer, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with one recorded episode and its previews."""
     folder = tmp_path_factory.mktemp("recorded")
     record.record_episode(SHORT, folder, folder / "previews")

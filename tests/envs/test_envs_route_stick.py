@@ -1,6 +1,5 @@
 """RouteStick: the row of discs and obstacles, the drawn route, the sense of each turn, and everything that fails."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -9,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_stick import Ear, Flags, Tip, circle, read_route, say
-from helpers.env_unmask import make, texts, wait
+from helpers.env_tasks import Ear, Flags, Tip, wait
 from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.objects import Disc
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.tasks.route_stick import RouteStick
 
@@ -19,18 +18,23 @@ MOVES = {"easy": ((2, 3), False), "medium": ((4, 5), False), "hard": ((4, 7), Tr
 """How many, and whether they may turn back."""
 OTHER = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
 
-
-@pytest.fixture(scope="module")
-def stick() -> Iterator[RouteStick]:
-    env = make(RouteStick, 4, "medium")
-    yield env
-    env.close()
+SCENE = (RouteStick, 4, "medium")
 
 
-@pytest.fixture
-def tip(stick: RouteStick, monkeypatch: pytest.MonkeyPatch) -> Tip:
-    stick.reset()
-    return Tip(stick, monkeypatch)
+def circle(tip: Tip, start: Disc, goal: Disc, direction: str) -> Flags:
+    """Follow the demonstrator's arc; the flags at its end."""
+    return [tip.put(point) for point in arc(start.position, goal.position, direction)][-1]
+
+
+def read_route(stream: Draws, moves: tuple[int, int], may_return: bool) -> tuple[list[int], list[str]]:
+    """Read the indices of a route and the sense of each turn from a stream."""
+    count = stream.integer(moves[0], moves[1] + 1)
+    route = [stream.integer(0, 5)]
+    for _ in range(count):
+        came_from = route[-2] if len(route) > 1 and 0 < route[-1] < 4 and not may_return else None
+        ways = [i for i in (route[-1] - 1, route[-1] + 1) if 0 <= i < 5 and i != came_from]
+        route.append(ways[stream.integer(0, len(ways))])
+    return route, ["clockwise" if stream.uniform() < 0.5 else "counterclockwise" for _ in range(count)]
 
 
 def follow(env: RouteStick, tip: Tip) -> list[Flags]:
@@ -48,11 +52,11 @@ def watch(env: RouteStick, tip: Tip) -> None:
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("seed", [1, 2, 5])
-def test_everything_comes_from_the_stream_in_order(seed, difficulty, monkeypatch):
+def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty, monkeypatch):
     colours = []
     build = RouteStick.build.__globals__["build_obstacle"]
     monkeypatch.setitem(RouteStick.build.__globals__, "build_obstacle", lambda *a: colours.append(a[-1]) or build(*a))
-    env = make(RouteStick, seed, difficulty)
+    env = build_task(RouteStick, seed, difficulty)
     stream = Draws(seed)
     turn = Rotation.from_euler("z", -30 + 60 * stream.uniform(), degrees=True)
     visible, hidden, blocks = (
@@ -70,46 +74,45 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, monkeypatch
         np.testing.assert_allclose(row, turn.apply([0, 1, 0]), atol=1e-6)
     assert colours == [tuple(stream.uniforms(3).tolist()) for _ in range(4)]
     assert ([env.discs.index(disc) for disc in env.route], env.directions) == read_route(stream, *MOVES[difficulty])
-    env.close()
 
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
-def test_routes_go_to_neighbours_and_may_return_only_where_they_may(stick, monkeypatch, difficulty):
+def test_routes_go_to_neighbours_and_may_return_only_where_they_may(env, monkeypatch, difficulty):
     for name in ("difficulty", "route", "directions"):
-        monkeypatch.setattr(stick, name, difficulty)
+        monkeypatch.setattr(env, name, difficulty)
     counts, returns, (moves, may_return) = set(), 0, MOVES[difficulty]
     for seed in range(100):
-        stick._draw_route(Draws(seed))
-        route = [stick.discs.index(disc) for disc in stick.route]
-        assert (route, stick.directions) == read_route(Draws(seed), moves, may_return)
+        env._draw_route(Draws(seed))
+        route = [env.discs.index(disc) for disc in env.route]
+        assert (route, env.directions) == read_route(Draws(seed), moves, may_return)
         returns += sum(a == c and 0 < b < 4 for a, b, c in zip(route, route[1:], route[2:], strict=False))
-        counts.add(len(stick.directions))
+        counts.add(len(env.directions))
     assert counts == set(range(moves[0], moves[1] + 1)) and (returns > 0) == may_return
 
 
-def test_the_same_route_again_is_success(stick, tip):
-    watch(stick, tip)
-    assert follow(stick, tip) == [(False, False)] * (len(stick.directions) - 1) + [(True, False)]
+def test_the_same_route_again_is_success(env, tip):
+    watch(env, tip)
+    assert follow(env, tip) == [(False, False)] * (len(env.directions) - 1) + [(True, False)]
 
 
-def test_a_target_is_reached_within_three_centimetres_and_below_fifteen(stick, tip):
-    tip.put(stick.route[0], aside=(0.02, 0))
-    assert stick.progress.index == 0  # the first approach is exact
-    tip.put(stick.route[0])
-    way = list(arc(stick.route[0].position, stick.route[1].position, stick.directions[0]))
+def test_a_target_is_reached_within_three_centimetres_and_below_fifteen(env, tip):
+    tip.put(env.route[0], aside=(0.02, 0))
+    assert env.progress.index == 0  # the first approach is exact
+    tip.put(env.route[0])
+    way = list(arc(env.route[0].position, env.route[1].position, env.directions[0]))
     for point in way[:30]:
         tip.put(point)
     for z, aside in ((0.151, 0), (0.149, 0.031)):
-        tip.put(stick.route[1], z=z, aside=(aside, 0))
-        assert stick.progress.index == 1
-    assert tip.put(stick.route[1], z=0.149, aside=(0.029, 0)) == (False, False) and stick.progress.index == 2
+        tip.put(env.route[1], z=z, aside=(aside, 0))
+        assert env.progress.index == 1
+    assert tip.put(env.route[1], z=0.149, aside=(0.029, 0)) == (False, False) and env.progress.index == 2
 
 
 @pytest.mark.parametrize("stage", ["video", "execution"])
 @pytest.mark.parametrize("move", [0, 1])
-def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(stick, tip, stage, move):
-    watch(stick, tip) if stage == "execution" else tip.put(stick.route[0])
-    legs = list(zip(pairwise(stick.route), stick.directions, strict=True))
+def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(env, tip, stage, move):
+    watch(env, tip) if stage == "execution" else tip.put(env.route[0])
+    legs = list(zip(pairwise(env.route), env.directions, strict=True))
     for leg, direction in legs[:move]:
         assert circle(tip, *leg, direction) == (False, False)
     (start, goal), direction = legs[move]
@@ -118,41 +121,31 @@ def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(stick, tip, s
     assert circle(tip, start, goal, direction) == (False, True)
 
 
-def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(stick, monkeypatch):
-    for place in set(stick.all_discs) - set(stick.route[:2]):
-        stick.reset()
-        tip = Tip(stick, monkeypatch)
-        watch(stick, tip)
+def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(env, monkeypatch):
+    for place in set(env.all_discs) - set(env.route[:2]):
+        env.reset()
+        tip = Tip(env, monkeypatch)
+        watch(env, tip)
         assert tip.put(place, z=0.101) == tip.put(place, aside=(0.011, 0)) == (False, False)
         assert tip.put(place, z=0.099, aside=(0.009, 0)) == tip.put((0.4, 0.4)) == (False, True)
 
 
-def test_a_target_is_highlighted_for_40_steps_after_the_tip_was_near(stick, tip):
-    disc, mark = stick.route[0], stick._marks[stick.discs.index(stick.route[0])]
+def test_a_target_is_highlighted_for_40_steps_after_the_tip_was_near(env, tip):
+    disc, mark = env.route[0], env._marks[env.discs.index(env.route[0])]
     tip.put(disc, aside=(0.029, 0))
-    wait(stick)
+    wait(env)
     tip.put((0.4, 0.4))
-    wait(stick, 40)
+    wait(env, 40)
     assert mark.position == pytest.approx(disc.position - [0, 0, 0.01])
-    wait(stick)
+    wait(env)
     assert mark.position[2] < -5
 
 
-def test_texts_goals_and_choices(stick, tip):
+def test_an_option_goes_to_the_neighbour_on_its_side(env, tip):
     order = [(side, direction) for direction in ("clockwise", "counterclockwise") for side in ("left", "right")]
-    sides = ["left" if b.position[1] > a.position[1] else "right" for a, b in pairwise(stick.route)]
-    kinds = list(zip(sides, stick.directions, strict=True))
-    moves = [(say(*kind), say(*kind), "abcd"[order.index(kind)]) for kind in kinds]
-    pause = ("NO RECORD", "NO RECORD", "")
-    assert texts(stick) == [pause, *moves, pause, pause, *moves]
-    around = "use the stick attached to the robot to navigate around the sticks on the table, following the same path"
-    assert stick.goals() == [f"watch the video carefully, then {around}{end}" for end in ("", " shown in the video")]
-    assert [(c.label, c.action, c.needs_point) for c in stick.choices()] == [
-        (letter, say(*kind), False) for letter, kind in zip("abcd", order, strict=True)
-    ]
     for here in range(5):
-        tip.put(stick.discs[here], aside=(0.02, 0.02))
-        for option, (side, direction) in zip(stick.choices(), order, strict=True):
+        tip.put(env.discs[here], aside=(0.02, 0.02))
+        for option, (side, direction) in zip(env.choices(), order, strict=True):
             ear, there = Ear(), here + (1 if side == "left" else -1)
             option.run(ear, None)
-            assert ear.calls == ([(stick.discs[there], direction)] if 0 <= there < 5 else [])
+            assert ear.calls == ([(env.discs[there], direction)] if 0 <= there < 5 else [])

@@ -15,13 +15,11 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from helpers.env_scenes import Scene, one_of_everything, recorded, replay, setup
 from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
-from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.robot.robots import description
 from mme_vla.envs.scene.objects import (
     build_disc,
 )
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
-from mme_vla.errors import UserError
 
 PICK = ("PickXtimes", 8)
 LOCK = ("PatternLock", 8)
@@ -126,15 +124,13 @@ def test_a_derived_robot_description_is_saved_once(tmp_path, monkeypatch):
     assert "<visual" not in first.read_text() and len(list(tmp_path.rglob("*.*rdf"))) == 2
 
 
-def test_the_official_layout_and_words_come_out_of_the_seed(pick, h5_folder):
+def test_the_official_layout_comes_out_of_the_seed(pick, h5_folder):
     pick.reset()
     assert pick.goals() == [goal.decode() for goal in setup(h5_folder, *PICK, "task_goal")]
     waypoints = recorded(h5_folder, *PICK, "action/waypoint_action")
     stages = [waypoints[k, :2] for k in (6, 144, 238)]
     for thing, xy in zip((pick.cube, pick.target, pick.button), stages, strict=True):
         assert thing.position[:2] == pytest.approx(xy, abs=2e-6), thing.name
-    texts = list(dict.fromkeys(recorded(h5_folder, *PICK, "info/simple_subgoal_online")))
-    assert [subtask.text for subtask in pick.subtasks()] == [text.decode() for text in texts]
     assert project(pick.cube.position).round().tolist() == [54, 145]  # the recorded choice
     assert project(pick.target.position).round().tolist() == [93, 109]
 
@@ -145,15 +141,6 @@ def test_recorded_actions_have_the_recorded_effect(pick, h5_folder):
     completed = recorded(h5_folder, *PICK, "info/is_completed").astype(bool)
     assert error[~completed].max() < 1e-4  # grasp, lift and release included
     assert error.max() < 5e-3  # after the episode's end the fingers slide on the button's cap
-
-
-def test_the_same_actions_after_a_reset_do_the_same(pick, h5_folder):
-    actions = recorded(h5_folder, *PICK, "action/joint_action")[:130]
-    runs = []
-    for _ in range(2):
-        pick.reset()
-        runs.append((play(pick, actions)[0], pick.cube.position))
-    assert runs[0][0] == pytest.approx(runs[1][0], abs=1e-6) and runs[0][1] == pytest.approx(runs[1][1], abs=1e-6)
 
 
 def test_the_stick_robot_has_the_recorded_wrist_camera_and_tool(h5_folder):
@@ -182,18 +169,9 @@ def test_the_stick_robot_moves_as_recorded(h5_folder):
     env.close()
 
 
-def test_the_first_images_are_the_recorded_ones(h5_folder):
-    try:
-        backend = render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
-    env = PickXtimes(obs_mode="rgb+depth+segmentation", render_backend=backend, seed=1800, difficulty="easy")
+def test_objects_have_their_pixels_where_the_official_images_show_them(h5_folder, renderer):
+    env = PickXtimes(obs_mode="rgb+depth+segmentation", render_backend=renderer, seed=1800, difficulty="easy")
     sensors = env.step(recorded(h5_folder, *PICK, "action/joint_action")[0].astype(np.float32))[0]["sensor_data"]
-    for camera, name in (("base_camera", "front"), ("hand_camera", "wrist")):
-        image, depth = (sensors[camera][key][0].numpy().astype(int) for key in ("rgb", "depth"))
-        # Equal with the renderer of the recording; drivers differ a little in shading.
-        assert np.abs(image - recorded(h5_folder, *PICK, f"obs/{name}_rgb")[0]).mean() < 2
-        assert np.abs(depth - recorded(h5_folder, *PICK, f"obs/{name}_depth")[0]).mean() < 0.5
     pixels = sensors["base_camera"]["segmentation"][0, ..., 0].numpy()
     assert centroid(pixels, env.cube.segmentation_ids) == (53, 144)
     assert centroid(pixels, env.target.segmentation_ids) == (92, 108)
@@ -201,18 +179,14 @@ def test_the_first_images_are_the_recorded_ones(h5_folder):
     env.close()
 
 
-def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed() -> None:
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed(renderer: str) -> None:
     from mme_vla.envs.scene.motions import Mark, build_mark
 
     def fill(env: Scene) -> None:
         env.add(build_disc(env, "target", 0.04, 0.005, "gray", (0.0, 0.0)))
         env.add(build_mark(env, "mark", 0.0402, 0.014))
 
-    env = Scene(fill, obs_mode="rgb", render_backend=render_backend(), sim_backend="physx_cpu")
+    env = Scene(fill, obs_mode="rgb", render_backend=renderer, sim_backend="physx_cpu")
     target, disc = (next(thing for thing in env.things if thing.name == name) for name in ("target", "mark"))
     body = disc.entity._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
 

@@ -51,18 +51,31 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
     return Control(task, steps.append, hand), steps, hand  # type: ignore[arg-type]
 
 
-def test_joint_angles_are_one_step_unchanged() -> None:
-    targets, steps, _ = control()
-    action_space("joint_angle").act(targets, [*JOINTS, -1.0])
-    assert len(steps) == 1
-    np.testing.assert_array_equal(steps[0], [*JOINTS, -1.0])
+@pytest.mark.parametrize(
+    ("name", "stick", "action", "step"),
+    [
+        ("joint_angle", False, [*JOINTS, -1.0], [*JOINTS, -1.0]),
+        ("joint_angle", True, JOINTS, JOINTS),
+        ("joint_angle", True, [*JOINTS, -1.0], JOINTS),
+        ("joint_angle", True, [*JOINTS, -1.0, 3.0], JOINTS),
+        ("ee_pose", False, [*POSE, 1.0], [0, 1, 2, 3, 4, 5, 6, 1]),
+        ("ee_pose", True, POSE, [0, 1, 2, 3, 4, 5, 6]),
+    ],
+)
+def test_joints_and_poses_are_one_step(name: str, stick: bool, action: list[float], step: list[float]) -> None:
+    targets, steps, _ = control(stick)
+    action_space(name).act(targets, action)
+    np.testing.assert_array_equal(steps, [step])
 
 
-@pytest.mark.parametrize("extra", [[], [-1.0], [-1.0, 3.0]])
-def test_the_stick_takes_the_first_seven_joint_angles(extra: list[float]) -> None:
-    targets, steps, _ = control(stick=True)
-    action_space("joint_angle").act(targets, [*JOINTS, *extra])
-    np.testing.assert_array_equal(steps, [JOINTS])
+@pytest.mark.parametrize(
+    ("stick", "gripper", "expected"),
+    [(False, -1.0, ["close"]), (False, 1.0, ["open"]), (False, 0.3, []), (False, -0.99, []), (True, -1.0, [])],
+)
+def test_a_waypoint_moves_a_gripper_only_at_exactly_one(stick: bool, gripper: float, expected: list[str]) -> None:
+    targets, _, hand = control(stick)
+    action_space("waypoint").act(targets, [*POSE, gripper])
+    assert hand.done == [[0.1, 0.0, 0.2], *expected]
 
 
 @pytest.mark.parametrize(
@@ -95,36 +108,11 @@ def test_malformed_actions_are_refused_without_a_step(name: str, stick: bool, ac
     assert not hand.done
 
 
-def test_a_pose_becomes_joint_angles_and_keeps_the_gripper() -> None:
-    targets, steps, _ = control()
-    action_space("ee_pose").act(targets, [*POSE, 1.0])
-    np.testing.assert_array_equal(steps, [[0, 1, 2, 3, 4, 5, 6, 1]])
-
-
-def test_a_stick_needs_no_gripper_number() -> None:
-    targets, steps, _ = control(stick=True)
-    action_space("ee_pose").act(targets, POSE)
-    np.testing.assert_array_equal(steps, [[0, 1, 2, 3, 4, 5, 6]])
-
-
 def test_an_unreachable_pose_says_so() -> None:
     targets, steps, _ = control(reachable=False)
     with pytest.raises(UnreachableError, match="IK failed"):
         action_space("ee_pose").act(targets, [*POSE, 1.0])
     assert not steps
-
-
-@pytest.mark.parametrize(("gripper", "expected"), [(-1.0, ["close"]), (1.0, ["open"]), (0.3, []), (-0.99, [])])
-def test_a_waypoint_moves_the_gripper_only_at_exactly_one(gripper: float, expected: list[str]) -> None:
-    targets, _, hand = control()
-    action_space("waypoint").act(targets, [*POSE, gripper])
-    assert hand.done == [[0.1, 0.0, 0.2], *expected]
-
-
-def test_the_stick_has_no_gripper_to_move() -> None:
-    targets, _, hand = control(stick=True)
-    action_space("waypoint").act(targets, [*POSE, -1.0])
-    assert hand.done == [[0.1, 0.0, 0.2]]
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -148,11 +136,6 @@ def test_an_unknown_choice_takes_no_step_and_warns() -> None:
         action_space("multi_choice").act(targets, {"choice": "Z"})
     assert not steps
     assert not hand.done
-
-
-def test_an_unknown_action_space_is_refused() -> None:
-    with pytest.raises(UserError, match="joint_angle"):
-        action_space("joint_angles")
 
 
 @pytest.mark.parametrize("stick", [False, True])

@@ -73,14 +73,8 @@ def test_a_restored_episode_goes_on_to_the_last_bit(
     fresh.close()
 
 
+@pytest.mark.usefixtures("renderer")
 def test_the_newest_frame_is_rendered_and_the_request_stays_what_it_was() -> None:
-    pytest.importorskip("sapien")
-    from mme_vla.envs.rendering import render_backend
-
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
     env = make_env("PickXtimes", "test", 0)
     assert isinstance(env, RoboMMEEnv)
     env.reset()

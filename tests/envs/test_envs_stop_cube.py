@@ -1,14 +1,11 @@
 """StopCube: the cube's way, when stopping it counts, and everything that fails."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import Flags, read_button
-from helpers.env_unmask import make, push_down, texts, wait
+from helpers.env_tasks import Flags, push_down, read_button, wait
 from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import distance_xy
@@ -25,19 +22,14 @@ def a_seed(interval: int, visit: int) -> int:
     raise AssertionError
 
 
-@pytest.fixture(scope="module")
-def second() -> Iterator[StopCube]:
-    env = make(StopCube, a_seed(60, 2), "easy")  # crossings at steps 30, 90, 150, ...
-    yield env
-    env.close()
+SCENE = (StopCube, a_seed(60, 2), "easy")  # crossings at steps 30, 90, 150, ...
 
 
 @pytest.fixture
-def prepared(second: StopCube, monkeypatch: pytest.MonkeyPatch) -> StopCube:
+def prepared(env: StopCube, monkeypatch: pytest.MonkeyPatch) -> StopCube:
     """The arm counts as being above the button."""
-    second.reset()
     monkeypatch.setattr("mme_vla.envs.tasks.stop_cube.hovering", lambda *_: True)
-    return second
+    return env
 
 
 def stop_at(env: StopCube, step: int) -> Flags:
@@ -49,8 +41,8 @@ def stop_at(env: StopCube, step: int) -> Flags:
 
 
 @pytest.mark.parametrize(("seed", "difficulty"), [(1, "easy"), (2, "medium"), (3, "hard"), (4, "easy"), (5, "hard")])
-def test_everything_comes_from_the_stream_in_order(seed, difficulty):
-    env = make(StopCube, seed, difficulty)
+def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
+    env = build_task(StopCube, seed, difficulty)
     stream = Draws(seed)
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
     x, y = stream.between(-0.1, 0.1), stream.between(-0.1, 0.1)
@@ -62,17 +54,15 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty):
     angle = np.deg2rad(stream.between(-30, 30))
     start = [x + 0.3 * np.sin(angle), y - 0.3 * np.cos(angle), 0.01]
     np.testing.assert_allclose(env.cube.position, start, atol=1e-6)
-    env.close()
 
 
-def test_the_cube_goes_back_and_forth_five_times_and_then_rests(second):
-    second.reset()
-    start, target = second.cube.position, second.target.position
+def test_the_cube_goes_back_and_forth_five_times_and_then_rests(env):
+    start, target = env.cube.position, env.target.position
     end = 2 * target - start
-    second.latch_failure, places = False, {0: start}
+    env.latch_failure, places = False, {0: start}
     for k in range(1, 320):
-        wait(second)
-        places[k] = second.cube.position
+        wait(env)
+        places[k] = env.cube.position
     for k, expected in {30: target, 60: end, 90: target, 120: start, 270: target, 300: end, 319: end}.items():
         np.testing.assert_allclose(places[k][:2], expected[:2], atol=1e-6)
     share = np.linalg.norm(places[15] - start) / np.linalg.norm(end - start)
@@ -105,9 +95,8 @@ def test_not_stopped_before_the_stay_is_over_fails(prepared):
     assert wait(prepared) == (False, True)
 
 
-def test_stopped_in_time_but_not_announced_is_not_yet_success(second):
-    second.reset()
-    assert stop_at(second, 90) == (False, False) and second.progress.index == 0
+def test_stopped_in_time_but_not_announced_is_not_yet_success(env):
+    assert stop_at(env, 90) == (False, False) and env.progress.index == 0
 
 
 @pytest.mark.parametrize(
@@ -115,31 +104,13 @@ def test_stopped_in_time_but_not_announced_is_not_yet_success(second):
     [(60, 2, [60]), (80, 2, [90]), (60, 4, [100, 180]), (120, 3, [100, 200, 270]),
      (120, 5, [100, 200, 300, 400, 500, 510])],
 )  # fmt: skip
-def test_waiting_is_cut_at_every_100th_step_and_ends_before_the_crossing(second, monkeypatch, interval, visit, steps):
-    monkeypatch.setattr(second, "interval", interval)
-    monkeypatch.setattr(second, "visit", visit)
-    assert second.checkpoints() == steps
+def test_waiting_is_cut_at_every_100th_step_and_ends_before_the_crossing(env, monkeypatch, interval, visit, steps):
+    monkeypatch.setattr(env, "interval", interval)
+    monkeypatch.setattr(env, "visit", visit)
+    assert env.checkpoints() == steps
 
 
-def test_texts_goals_and_choices(second):
-    hover = "move to the top of the button"
-    press = "press the button to stop the cube on the target"
-    assert texts(second) == [
-        (f"{hover} to prepare", f"{hover} at <> to prepare", "a"),
-        ("remain static", "remain static", "b"),
-        (press, f"{press} at <>", "c"),
-    ]
-    assert second.progress.subtasks[0].targets == [second.button]
-    assert second.progress.subtasks[2].targets == [second.target]
-    assert second.goals() == [
-        "press the button to stop the cube just as it reaches the target for the second time",
-        "press the button to stop the cube exactly at the target on its second visit",
-    ]
-    assert [option.needs_point for option in second.choices()] == [False] * 3
-
-
-def test_choosing_to_wait_leads_to_the_next_checkpoint(second):
-    second.reset()
-    demo = Demonstrator(second, lambda action: second.step(np.asarray(action, np.float32)))
-    second.choices()[1].run(demo, None)
-    assert second.steps_done == 60  # whole gripper motions of six steps
+def test_choosing_to_wait_leads_to_the_next_checkpoint(env):
+    demo = Demonstrator(env, lambda action: env.step(np.asarray(action, np.float32)))
+    env.choices()[1].run(demo, None)
+    assert env.steps_done == 60  # whole gripper motions of six steps

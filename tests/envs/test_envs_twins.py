@@ -10,8 +10,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from sapien import physx
 
-from helpers.env_cubes import Hand
-from helpers.env_unmask import make, wait
+from helpers.env_tasks import Hand, make, wait
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs import make_env, metadata
 from mme_vla.envs.grounding import project

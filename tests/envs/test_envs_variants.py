@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_unmask import make, wait
+from helpers.env_tasks import make, wait
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks, make_env
 from mme_vla.envs.metadata import DIALS, TASK_NAMES, read_variant

@@ -1,14 +1,11 @@
 """VideoRepick: layout, the swaps after the first pick, which picks count, and when the button may be pressed."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube
-from helpers.env_unmask import make, push_down, texts, wait
+from helpers.env_tasks import COLOURS, go_to, least_distance, push_down, read_button, read_cube, wait
 from mme_vla.envs.scene.placement import Draws, Region, rotated_anchors
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.video_repick import VideoRepick
@@ -19,10 +16,7 @@ FIRST, SECOND = (f"pick up the correct cube for the {i} time" for i in ("first",
 SHOWN = ["pick up the cube", "drop the cube on the table"]
 PUT, PRESS = "put it down", "press the button to finish"
 
-
-def at(env: VideoRepick, text: str) -> None:
-    """Go to the first sub-task of the execution that has this text."""
-    env.progress.index = next(i for i, s in enumerate(env.progress.subtasks) if s.text == text and not s.video)
+SCENE = (VideoRepick, 1, "hard")  # two repetitions, no swaps
 
 
 def pressed_after(env: VideoRepick, steps: int) -> bool:
@@ -34,23 +28,10 @@ def pressed_after(env: VideoRepick, steps: int) -> bool:
     return failed
 
 
-@pytest.fixture(scope="module")
-def twice() -> Iterator[VideoRepick]:
-    env = make(VideoRepick, TWICE, "hard")
-    yield env
-    env.close()
-
-
-@pytest.fixture
-def hand(twice: VideoRepick, monkeypatch: pytest.MonkeyPatch) -> Hand:
-    twice.reset()
-    return Hand(twice, monkeypatch)
-
-
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_everything_comes_from_one_stream_in_order(seed, difficulty):
-    env, stream = make(VideoRepick, seed, difficulty, recovery="z"), Draws(seed)
+def test_everything_comes_from_one_stream_in_order(build_task, seed, difficulty):
+    env, stream = build_task(VideoRepick, seed, difficulty, recovery="z"), Draws(seed)
     assert env.repetitions == stream.integer(1, 4) and env.repetitions in (1, 2, 3)
     low, high = SWAPS.get(difficulty, (0, 0))
     assert low <= env.swap_count <= high and env.swap_count == stream.integer(low, high + 1)
@@ -73,26 +54,10 @@ def test_everything_comes_from_one_stream_in_order(seed, difficulty):
     assert env.failed_pick == [stream.integer(0, env.repetitions) for _ in range(2)][1]
     assert least_distance(env.cubes) >= 0.04  # a cube counts as a line only where its box happens to stand on end
     assert min(distance_xy(cube.position, env.button.position) for cube in env.cubes) > 0.05625 + 0.04
-    env.close()
 
 
-def test_texts_and_goals_of_two_repetitions_without_swaps(twice):
-    assert [step.text for step in twice.progress.subtasks if step.video] == [*SHOWN, "NO RECORD"]
-    assert texts(twice)[3:] == [
-        (FIRST, "pick up the correct cube at <> for the first time", "a"),
-        (PUT, PUT, "b"),
-        (SECOND, "pick up the correct cube at <> for the second time", "a"),
-        (PUT, PUT, "b"),
-        (PRESS, "press the button at <> to finish", "c"),
-    ]
-    again = "repeatedly pick up and put down the same block that was previously picked up for two times"
-    ends = ("finally put it down and press the button to stop", "finally press the button to stop")
-    assert twice.goals() == [f"watch the video carefully, then {again}, {end}" for end in ends]
-    assert [option.needs_point for option in twice.choices()] == [True, False, False]
-
-
-def test_the_video_ends_with_the_swaps_one_after_another():
-    env = make(VideoRepick, ONCE, "medium")
+def test_the_video_ends_with_the_swaps_one_after_another(build_task):
+    env = build_task(VideoRepick, ONCE, "medium")
     assert env.repetitions == 1 and env.swap_count == 3
     video = [*SHOWN, *["static"] * 4, "NO RECORD"]
     assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]
@@ -114,54 +79,53 @@ def test_the_video_ends_with_the_swaps_one_after_another():
             assert distance_xy(cube.position, start[place]) < 6e-3
     assert env.progress.index == 5  # the third of three stages of 50 steps
     assert wait(env, 5) == (False, False) and env.progress.index == 6
-    env.close()
 
 
-def test_as_many_picks_as_requested_and_the_button_are_success(twice, hand):
-    at(twice, FIRST)
+def test_as_many_picks_as_requested_and_the_button_are_success(env, hand):
+    go_to(env, FIRST)
     for _ in range(2):
-        assert hand.carry(twice.cube) == (False, False)
+        assert hand.carry(env.cube) == (False, False)
         assert hand.release() == (False, False)
-    assert twice.progress.current.text == PRESS
-    assert push_down(twice, twice.button) == (True, False)
-    twice.button.restore()
-    assert wait(twice) == (True, False)
+    assert env.progress.current.text == PRESS
+    assert push_down(env, env.button) == (True, False)
+    env.button.restore()
+    assert wait(env) == (True, False)
 
 
 @pytest.mark.parametrize("stage", [FIRST, PUT, SECOND])
-def test_another_cube_picked_up_is_a_lasting_failure(twice, hand, stage):
-    at(twice, stage)
-    other = next(c for c in twice.cubes if c is not twice.cube and c.colour == twice.cube.colour)
+def test_another_cube_picked_up_is_a_lasting_failure(env, hand, stage):
+    go_to(env, stage)
+    other = next(c for c in env.cubes if c is not env.cube and c.colour == env.cube.colour)
     assert hand.carry(other) == (False, True)
     assert hand.release() == (False, True)
 
 
 @pytest.mark.parametrize("right", [True, False])
-def test_any_cube_picked_up_instead_of_pressing_fails(twice, hand, right):
-    at(twice, PRESS)
-    assert hand.carry(twice.cube if right else twice.cubes[twice.cubes.index(twice.cube) - 1]) == (False, True)
-    assert push_down(twice, twice.button) == (False, True)
+def test_any_cube_picked_up_instead_of_pressing_fails(env, hand, right):
+    go_to(env, PRESS)
+    assert hand.carry(env.cube if right else env.cubes[env.cubes.index(env.cube) - 1]) == (False, True)
+    assert push_down(env, env.button) == (False, True)
 
 
 @pytest.mark.parametrize("stage", [FIRST, PUT])
 @pytest.mark.parametrize(("steps", "fails"), [(0, False), (49, False), (50, True), (500, True), (501, False)])
-def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_entered(twice, hand, stage, steps, fails):
-    at(twice, stage)
+def test_pressing_too_early_fails_from_50_to_500_steps_after_the_stage_was_entered(env, hand, stage, steps, fails):
+    go_to(env, stage)
     if stage == PUT:
-        hand.carry(twice.cube)  # which enters the stage, too
-    twice.evaluate()
-    assert pressed_after(twice, steps) == fails
-    assert wait(twice) == (False, fails)
+        hand.carry(env.cube)  # which enters the stage, too
+    env.evaluate()
+    assert pressed_after(env, steps) == fails
+    assert wait(env) == (False, fails)
 
 
-def test_picks_and_puts_have_a_timer_each_which_the_second_round_does_not_restart(twice, hand):
-    at(twice, FIRST)
-    twice.evaluate()
-    twice._elapsed_steps += 100
-    hand.carry(twice.cube)  # the pick is done
-    assert not pressed_after(twice, 0)  # the wait of the put begins here
+def test_picks_and_puts_have_a_timer_each_which_the_second_round_does_not_restart(env, hand):
+    go_to(env, FIRST)
+    env.evaluate()
+    env._elapsed_steps += 100
+    hand.carry(env.cube)  # the pick is done
+    assert not pressed_after(env, 0)  # the wait of the put begins here
     hand.release()
-    assert twice.progress.current.text == SECOND
-    assert not pressed_after(twice, 460)  # 560 steps after the first pick began
-    assert hand.carry(twice.cube) == (False, False)
-    assert pressed_after(twice, 0)  # some 460 steps after the first put began
+    assert env.progress.current.text == SECOND
+    assert not pressed_after(env, 460)  # 560 steps after the first pick began
+    assert hand.carry(env.cube) == (False, False)
+    assert pressed_after(env, 0)  # some 460 steps after the first put began

@@ -6,11 +6,10 @@ import h5py
 import pytest
 
 from helpers import REPOSITORY
-from mme_vla import UserError, evaluate, make_env
+from mme_vla import evaluate, make_env
 from mme_vla.cli import record
 from mme_vla.config.composition import compose
 from mme_vla.config.plugins import import_plugins
-from mme_vla.envs.rendering import render_backend
 from mme_vla.testing import check_task
 from mme_vla.testing.small import SMALL_VISION, small_policy
 
@@ -60,11 +59,8 @@ def test_a_policy_is_evaluated_on_it_in_a_worker_process(tmp_path: Path) -> None
     assert [(r.task, r.episode, r.success) for r in run.records] == [("TwoButtons", 0, False)]
 
 
+@pytest.mark.usefixtures("renderer")
 def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
     selection = "frames=[0]"  # an image takes its time
     words = [
         "tasks=TwoButtons",

@@ -9,7 +9,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from helpers.h5_files import pose_at, write_file
+from helpers.h5_files import pose_at, robomme_robot, write_file
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
 from helpers.serving_fakes import Served, challenge
 from mme_vla import MMEPolicy, UserError
@@ -20,8 +20,7 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.data.waypoints import find_motions
-from mme_vla.embodiment import Embodiment
+from mme_vla.data.waypoints import find_choices, find_motions
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.processing.processor import Processor
@@ -30,34 +29,12 @@ from mme_vla.serving.server import PolicyServer
 from mme_vla.serving.settings import ServeSettings
 
 
-def robot(name: str) -> Embodiment:
-    section: Any = OmegaConf.to_container(compose("policy", [f"embodiment={name}"]).embodiment, resolve=True)
-    return Embodiment.from_dict(section)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two converted episodes, the first with a conditioning video of 8 of its 24 frames."""
-    place = tmp_path_factory.mktemp("poses")
-    write_file(place / "record_dataset_Alpha.h5", [24, 20], videos=[8, 0], poses=True)
-    convert(list_episodes(find_files([place])), place / "out", ConvertOptions(images="png"))
-    return place / "out"
-
-
 def test_poses_are_converted_and_read_as_actions(folder: Path) -> None:
-    source = EpisodeSource(folder, robot=robot("robomme_ee_pose"))
+    source = EpisodeSource(folder, robot=robomme_robot("robomme_ee_pose"))
     assert np.array_equal(source.actions(0), np.stack([pose_at(t) for t in range(24)]).astype(np.float32))
     assert source.states(0).shape == (24, 8) and list(source.decisions(0)) == list(range(8, 24))
     chunk, recorded = source.action_chunk(0, 20, 6, offset=1)
     assert np.array_equal(chunk[:, 0], np.float32([2.1, 2.2, 2.3, 2.3, 2.3, 2.3])) and recorded.sum() == 3
-
-
-def test_files_without_poses_convert_as_before(tmp_path: Path) -> None:
-    write_file(tmp_path / "record_dataset_Alpha.h5", [8])
-    convert(list_episodes(find_files([tmp_path])), tmp_path / "out", ConvertOptions(images="png"))
-    assert len(EpisodeSource(tmp_path / "out")) == 1
-    with pytest.raises(UserError, match="lacks the feature waypoint_actions"):
-        EpisodeSource(tmp_path / "out", robot=robot("robomme_waypoint"))
 
 
 def test_a_motion_is_decided_on_one_frame_before_it_begins() -> None:
@@ -71,7 +48,7 @@ def test_a_motion_is_decided_on_one_frame_before_it_begins() -> None:
 
 
 def test_training_samples_of_waypoints_are_the_decisions(folder: Path) -> None:
-    panda = robot("robomme_waypoint")
+    panda = robomme_robot("robomme_waypoint")
     source = EpisodeSource(folder, robot=panda)
     # Episode 0 notes its first waypoint at frame 11 of an execution that begins at 8, then every fourth frame another.
     assert source.decisions(0).tolist() == [8, 11, 15, 19]
@@ -86,21 +63,28 @@ def test_training_samples_of_waypoints_are_the_decisions(folder: Path) -> None:
     assert torch.allclose(back, torch.as_tensor(expected, dtype=torch.float32), atol=1e-3)
 
 
-@pytest.mark.parametrize("name", ["robomme_ee_pose", "robomme_waypoint"])
-def test_a_policy_of_poses_trains_and_keeps_its_robot(folder: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [("framesamp_modul", "robomme_ee_pose"), ("framesamp_modul", "robomme_waypoint"),
+     ("framesamp_modul", "robomme_choice"), ("simplesg", "robomme_choice")],
+)  # fmt: skip
+def test_a_policy_trains_and_keeps_its_robot(folder: Path, tmp_path: Path, model: str, name: str) -> None:
     words = [
-        "model=framesamp_modul", "memory.budget=64", f"embodiment={name}", f"data.sources=[{folder}]",
-        "data.val_episodes=[1]", f"data.cache.root={tmp_path / 'caches'}", "backbone.depth=1",
-        "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "logger=none",
-        "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=2",
-        "train.open_loop_chunks=1",
+        f"model={model}", f"embodiment={name}", f"data.sources=[{folder}]", "data.val_episodes=[1]",
+        f"data.cache.root={tmp_path / 'caches'}", "backbone.depth=1", "backbone.vision.depth=1",
+        "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "logger=none", "train.steps=2",
+        "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=2", "train.open_loop_chunks=1",
+        *(["memory.budget=64"] if "framesamp" in model else []),
     ]  # fmt: skip
     cfg = compose("train", words)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     policy = MMEPolicy.from_pretrained(train(cfg, config, tmp_path / "run", begun=time.perf_counter()))
-    assert policy.embodiment == robot(name)
     stats = policy.require_processor().require_stats()
-    assert len(stats.actions) == 7 and len(stats.state) == 8
+    assert policy.embodiment == robomme_robot(name) and len(stats.state) == 8
+    if name == "robomme_choice":
+        assert stats.actions.q99[:8].tolist() == [1] * 8
+    else:
+        assert len(stats.actions) == 7
 
 
 class MotionEnvs(InlineEnvs):
@@ -161,18 +145,38 @@ def test_a_policy_of_motions_is_served_a_motion_at_a_time() -> None:
         PolicyServer(reading, ServeSettings())
 
 
-@pytest.mark.parametrize("name", ["robomme_ee_pose", "robomme_waypoint"])
-def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(h5_folder: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "task"),
+    [("robomme_ee_pose", "PickXtimes"), ("robomme_waypoint", "PickXtimes"), ("robomme_choice", "PickXtimes"),
+     ("robomme_choice", "PatternLock")],
+)  # fmt: skip
+def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(h5_folder: Path, name: str, task: str) -> None:
     pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    panda, job = robot(name), Job("PickXtimes", "train", 8)
-    with open_episode(EpisodeRef(h5_folder / f"record_dataset_{job.task}.h5", job.episode, job.task)) as episode:
-        rows = episode.pose_actions(panda.action.key[0])[episode.exec_start :]
-    actions = rows if panda.action.frames == 1 else find_motions(rows, 0).targets
-    options = {"robot": panda, "action_space": panda.action.space, "render": False}
-    env = make_rollout_env(job.task, job.split, job.episode, **options)
-    env.reset()
+    panda, chooses = robomme_robot(name), name == "robomme_choice"
+    with open_episode(EpisodeRef(h5_folder / f"record_dataset_{task}.h5", 8, task)) as episode:
+        rows = episode.choice_actions() if chooses else episode.pose_actions(panda.action.key[0])
+        rows, recorded_options = rows[episode.exec_start :], episode.options
+    actions = rows
+    if chooses:
+        actions = find_choices(rows, 0, panda.action.choice).targets
+    elif panda.action.frames != 1:
+        actions = find_motions(rows, 0).targets
+    env = make_rollout_env(task, "train", 8, robot=panda, action_space=panda.action.space, render=False)
+    _, info = env.reset()
+    assert not chooses or info["available_multi_choices"] == recorded_options
     frames, _, terminated, _, report = env.step({"actions": actions})
     env.close()
     assert terminated and report["status"] == "success"
     assert len(frames["state"]) == report["steps"] >= report["executed"]
     assert (report["steps"] == report["executed"]) == (panda.action.frames == 1)
+
+
+def test_files_without_poses_or_choices_convert_as_before(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Alpha.h5", [8])
+    write_file(tmp_path / "record_dataset_Beta.h5", [8], choices=True)
+    convert(list_episodes(find_files([tmp_path])), tmp_path / "out", ConvertOptions(images="png"))
+    source = EpisodeSource(tmp_path / "out")
+    assert len(source) == 2 and "options" not in source.records[0]
+    for name, feature in (("robomme_waypoint", "waypoint_actions"), ("robomme_choice", "choice_actions")):
+        with pytest.raises(UserError, match=f"lacks the feature {feature}"):
+            EpisodeSource(tmp_path / "out", robot=robomme_robot(name))

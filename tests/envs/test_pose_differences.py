@@ -6,38 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
-from helpers.h5_files import pose_at, tool_at, write_file
+from helpers.h5_files import pose_at, robomme_robot, tool_at
 from helpers.prior_vla_runs import run
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
 from helpers.scripted_env import ScriptedEnv
 from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError
-from mme_vla.config.composition import compose
-from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.vector.pool import Job
 from mme_vla.policy.base import Policy
 
 NAME = "robomme_ee_delta"
-
-
-def robot(*words: str) -> Embodiment:
-    section: Any = OmegaConf.to_container(compose("policy", [f"embodiment={NAME}", *words]).embodiment, resolve=True)
-    return Embodiment.from_dict(section)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two converted episodes, the first with a conditioning video of 8 of its 24 frames."""
-    place = tmp_path_factory.mktemp("differences")
-    write_file(place / "record_dataset_Alpha.h5", [24, 20], videos=[8, 0], poses=True)
-    convert(list_episodes(find_files([place])), place / "out", ConvertOptions(images="png"))
-    return place / "out"
 
 
 def expected(number: int) -> np.ndarray:
@@ -47,7 +29,7 @@ def expected(number: int) -> np.ndarray:
 
 
 def test_differences_are_to_each_steps_pose_by_the_shorter_way(folder: Path) -> None:
-    source = EpisodeSource(folder, robot=robot())
+    source = EpisodeSource(folder, robot=robomme_robot(NAME))
     actions = source.actions(0)
     np.testing.assert_allclose(actions, [expected(t) for t in range(24)], atol=1e-5)
     assert source.actions(0, 5, 7).tolist() == actions[5:7].tolist()
@@ -55,20 +37,20 @@ def test_differences_are_to_each_steps_pose_by_the_shorter_way(folder: Path) -> 
 
 
 def test_past_the_end_nothing_moves_and_the_gripper_stays(folder: Path) -> None:
-    chunk, recorded = EpisodeSource(folder, robot=robot()).action_chunk(0, 20, 6, offset=1)
+    chunk, recorded = EpisodeSource(folder, robot=robomme_robot(NAME)).action_chunk(0, 20, 6, offset=1)
     assert recorded.tolist() == [True] * 3 + [False] * 3
     np.testing.assert_allclose(chunk[:3], [expected(t) for t in (21, 22, 23)], atol=1e-5)
     assert not chunk[3:, :6].any() and (chunk[3:, 6] == expected(23)[6]).all()
 
 
 def test_an_embodiment_says_which_numbers_they_are_and_keeps_it(folder: Path) -> None:
-    panda = robot()
+    panda = robomme_robot(NAME)
     assert Embodiment.from_dict(panda.to_dict()) == panda and panda.action.of_pose == tuple(range(6))
     assert (panda.action.space, panda.action.answers) == ("ee_pose", "ee_delta")
     assert "of_pose" not in replace(panda, action=replace(panda.action, of_pose=(), pose_key=())).to_dict()["action"]
     for words in (["embodiment.action.pose_key=null"], ["embodiment.action.frames=null"]):
         with pytest.raises(UserError, match="of_pose"):
-            robot(*words)
+            robomme_robot(NAME, *words)
     with pytest.raises(UserError, match="lacks the feature eef_state"):
         EpisodeSource("sample", robot=replace(panda, action=replace(panda.action, key=("actions",))))
 
@@ -129,6 +111,6 @@ def test_a_client_must_say_that_it_adds_the_pose() -> None:
 
 
 def test_statistics_are_of_the_differences(folder: Path) -> None:
-    panda = robot()
+    panda = robomme_robot(NAME)
     stats = compute_norm_stats([EpisodeSource(folder, robot=panda)], horizon=1, robot=panda, every=True, extremes=True)
     assert np.abs(stats.actions.max[:6]).max() < 0.2

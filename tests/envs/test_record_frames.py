@@ -20,7 +20,6 @@ from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job
 from mme_vla.envs.recording.recorder import RecordedStep, Recorder
-from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 
 POSES = [np.full(7, float(i), np.float32) for i in range(3)]
@@ -80,12 +79,8 @@ def test_what_is_no_choice_of_frames_is_refused(at: Any, memory: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> EpisodeRef:
+def recorded(renderer: str, tmp_path_factory: pytest.TempPathFactory) -> EpisodeRef:
     """The shortest demonstration there is, drawn at its decisions and where the memory then reads."""
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("frames")
     choice = FrameChoice("decisions", {"name": "framesamp", "budget": 64})
     job = Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3, frames=choice)

@@ -14,7 +14,7 @@ from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.progress import Durations, earlier_records
+from mme_vla.evaluation.rollout.progress import Durations
 from mme_vla.evaluation.rollout.runner import Waiting
 from mme_vla.evaluation.store import Claims, RecordLog
 from mme_vla.utils import write_json
@@ -130,18 +130,6 @@ def test_a_damaged_claim_is_named(content: str, tmp_path: Path, monkeypatch: pyt
             read()
 
 
-def test_a_folder_in_place_of_a_claim_is_named(tmp_path: Path) -> None:
-    (tmp_path / "claims" / "BinFill-0.0.json").mkdir(parents=True)
-    with pytest.raises(UserError, match=r"BinFill-0\.0\.json is damaged"):
-        Claims(tmp_path, "episodes-0of2.jsonl")
-
-
-def test_claims_of_earlier_versions_are_ignored(tmp_path: Path) -> None:
-    (tmp_path / "claims.jsonl").write_text("anything")
-    with RecordLog(tmp_path / "episodes-0of2.jsonl"):
-        assert taken(Claims(tmp_path, "episodes-0of2.jsonl").take(JOBS)) == 0
-
-
 def test_episodes_that_took_longest_begin_first() -> None:
     durations = Durations([record(0, 1), record(1, 4), record(0, 8, task="PickXtimes")])
     jobs = [*JOBS[:3], Job("PickXtimes", "test", 5), Job("StopCube", "test", 0)]
@@ -164,17 +152,6 @@ def test_the_forecast_follows_whoever_is_slower() -> None:
         "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1 before them did"
     )
     assert Durations([]).forecast(JOBS, workers=1) is None
-
-
-def test_earlier_records_are_those_beside_the_run_or_those_named(tmp_path: Path) -> None:
-    with RecordLog(tmp_path / "runs" / "seed7" / "episodes.jsonl") as log:
-        log.append(record(0))
-        log.append(record(1, outcome="error"))
-    assert len(earlier_records(tmp_path / "runs" / "seed42", None)) == 1
-    assert earlier_records(tmp_path / "seed42", None) == []
-    assert len(earlier_records(tmp_path, tmp_path / "runs")) == 1
-    with pytest.raises(UserError):
-        earlier_records(tmp_path, tmp_path / "nothing")
 
 
 def test_an_episode_that_is_tried_again_comes_last() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mme_vla.evaluation.rollout.video import BEHIND, EpisodeVideo
+from mme_vla.evaluation.rollout.video import EpisodeVideo
 from mme_vla.utils.media import VideoWriter, video_bytes, video_frame
 
 VIEWS = [[np.full((32, 48, 3), shade, np.uint8)] * 2 for shade in range(0, 240, 3)]
@@ -31,21 +31,6 @@ def test_the_video_is_the_one_that_is_compressed_at_once(tmp_path: Path, monkeyp
     assert path == tmp_path / "success.mp4"
     assert len(threads) == len(VIEWS) and all(thread.startswith("film") for thread in threads)
     assert path.read_bytes() == video_bytes(video_frame(views, "a caption") for views in VIEWS)
-
-
-def test_a_slow_video_is_waited_for_only_when_it_falls_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, add = threading.Event(), VideoWriter.add
-
-    def slow(writer: VideoWriter, image: np.ndarray) -> None:
-        assert gate.wait(10)
-        add(writer, image)
-
-    monkeypatch.setattr(VideoWriter, "add", slow)
-    recorder = video(tmp_path)
-    for _ in range(BEHIND):
-        recorder.add(VIEWS[0])  # none is compressed yet
-    gate.set()
-    assert recorder.finish("fail", "") is not None
 
 
 def test_what_goes_wrong_beside_the_simulation_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
-from helpers.scripted_env import VIDEO, make_scripted_env
+from helpers.scripted_env import VIDEO
 from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
-from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
-from mme_vla.subgoal.oracle import Oracle
 
 FRAMES = [VIDEO[JOBS[0].task] + 1 + STEPS, 1 + STEPS]
 MEMORIES: dict[str, dict[str, Any]] = {
@@ -40,14 +38,6 @@ def test_rendering_what_is_needed_changes_no_action(name: str) -> None:
         assert video["front"] == full["front"] == full["wrist"]
     else:
         assert full["front"] < FRAMES[1] and video["front"] < FRAMES[0]
-
-
-@pytest.mark.parametrize("name", ["simplesg", "groundsg"])
-def test_the_environments_subgoals_need_no_images(name: str) -> None:
-    policy = quick_policy(name)
-    kind = "simple" if name == "simplesg" else "grounded"
-    *_, video, full = both_ways(policy, Oracle(kind))
-    assert video == full == {"front": 5, "wrist": 5}
 
 
 class Watcher(SubgoalPredictor):
@@ -110,14 +100,6 @@ def test_a_video_shows_everything_and_changes_nothing(name: str, tmp_path: Path)
     assert all((tmp_path / record.extra["video"]).stat().st_size for record in recorded)
 
 
-def test_a_policy_that_does_not_say_what_it_reads_gets_all_frames() -> None:
-    policy = quick_policy("pi05")
-    policy.frames_read = lambda steps, exec_start: None
-    envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1)
-    roll(policy, JOBS, envs, max_steps=STEPS - 1)
-    assert [env.drawn["wrist"] for env in envs.made.values()] == FRAMES
-
-
 def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:
     lengths = iter(range(5, 99))
 
@@ -130,11 +112,6 @@ def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:
         roll(quick_policy("framesamp_modul", patch_size=8, memory={"budget": 64}), JOBS[:1], envs)
 
 
-def test_what_is_rendered_is_a_choice_of_two() -> None:
-    with pytest.raises(UserError, match=r"draw='need'.*needed"):
-        RolloutSettings(draw="need")
-
-
 def test_acting_on_a_frame_that_was_not_rendered_is_refused() -> None:
     policy = quick_policy("pi05")
     episode = policy.start_episode("pick up the cube")
@@ -144,7 +121,3 @@ def test_acting_on_a_frame_that_was_not_rendered_is_refused() -> None:
     assert episode.n_observed_frames == 3
     with pytest.raises(UserError, match="current frame was not rendered"):
         policy.act(episode)
-
-
-def test_an_environment_that_draws_everything_gives_the_same_results() -> None:
-    both_ways(quick_policy("ttt_modul", patch_size=8), base=make_scripted_env)

@@ -8,18 +8,15 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_cubes import Hand
-from helpers.env_unmask import lift, make, push_down, wait
+from helpers.env_tasks import Hand, make, push_down
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks
 from mme_vla.envs.metadata import TASK_NAMES
-from mme_vla.envs.scene.motions import COVER_STEPS
 from mme_vla.envs.subtasks import OPERATIONS, ProcessScore, Progress, SubTask, process_score
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
-from mme_vla.envs.tasks.video_unmask import VideoUnmask
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
@@ -50,16 +47,6 @@ def test_who_stops_too_early_has_lost_count_and_who_takes_another_cube_has_not(t
     hand.carry(next(cube for cube in twice.cubes if cube is not twice.cube))
     other = process_score(twice.progress, "fail")
     assert (other.done, other.broke, other.operation) == (0, "wrong", "motion") and not other.forgot
-
-
-def test_the_wrong_container_is_a_mistake_of_where() -> None:
-    env = make(VideoUnmask, 6300, "hard")
-    wait(env, COVER_STEPS + 2)
-    assert env.progress.current.text.startswith("pick up the container")
-    assert lift(env, env.containers[-1]) == (False, True)
-    score = process_score(env.progress, "fail")
-    assert (score.done, score.of, score.broke, score.operation) == (0, 3, "wrong", "where")
-    env.close()
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)

@@ -2,15 +2,15 @@
 
 import json
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mme_vla import UserError
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, Seconds, by_run, finished, merge
-from mme_vla.evaluation.store import RecordLog, claim_run, find_records, fingerprint, read_records, read_run
+from mme_vla.evaluation.records import EpisodeRecord, Seconds, by_run, merge
+from mme_vla.evaluation.store import RecordLog, claim_run, find_records, read_records, read_run
 
 
 def record(**changes: Any) -> EpisodeRecord:
@@ -26,28 +26,16 @@ def test_a_record_survives_its_line() -> None:
     assert EpisodeRecord.from_json(line) == made
 
 
-def test_a_checkpoint_step_is_one_checkpoint_as_text_or_number() -> None:
-    assert record(checkpoint="60000").run == record(checkpoint=60000).run
-    assert record(checkpoint="best").checkpoint == "best"
-
-
 def test_wrong_values_are_named() -> None:
-    with pytest.raises(UserError, match=r"outcome 'sucess'.*'success'"):
-        record(outcome="sucess")
-    with pytest.raises(UserError, match=r"episode='3'.*int, not str"):
-        record(episode="3")
-    with pytest.raises(UserError, match="unknown field 'sucess'"):
-        EpisodeRecord.from_json('{"sucess": true}')
-    with pytest.raises(UserError, match="missing"):
-        EpisodeRecord.from_json('{"model": "pi05"}')
-
-
-def test_every_record_is_on_disk_when_append_returns(tmp_path: Path) -> None:
-    path = tmp_path / "run" / "episodes.jsonl"
-    with RecordLog(path) as log:
-        for episode in range(3):
-            log.append(record(episode=episode))
-            assert read_records(path)[-1].episode == episode
+    good = asdict(record())
+    for values, message in (
+        ({**good, "outcome": "sucess"}, r"outcome='sucess'.*'success'"),
+        ({**good, "episode": "3"}, r"record\.episode='3' must be a whole number"),
+        ({**good, "sucess": True}, r"Unknown key record\.sucess"),
+        ({"model": "pi05"}, "lacks the key 'checkpoint'"),
+    ):
+        with pytest.raises(UserError, match=message):
+            EpisodeRecord.from_dict(values)
 
 
 def test_a_half_saved_last_line_is_ignored_and_then_repaired(tmp_path: Path) -> None:
@@ -74,13 +62,6 @@ def test_a_last_line_that_lacks_only_its_end_is_valid(tmp_path: Path) -> None:
         with RecordLog(path) as log:
             log.append(record(episode=1))
         assert [r.episode for r in read_records(path)] == [0, 1]
-
-
-def test_damage_in_other_lines_is_an_error_with_its_line(tmp_path: Path) -> None:
-    path = tmp_path / "episodes.jsonl"
-    path.write_text(f"{record().to_json()}\n{{broken\n{record(episode=1).to_json()}\n")
-    with pytest.raises(UserError, match="line 2"):
-        read_records(path)
 
 
 def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
@@ -125,13 +106,6 @@ def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
         merge([early], "lst")
 
 
-def test_other_runs_and_subgoals_and_budgets_do_not_conflict() -> None:
-    changes = {"model_seed": 0, "checkpoint": 1, "subgoal": "oracle", "memory_budget": 64, "split": "val"}
-    different = [record(), *(record(outcome="fail", **{name: value}) for name, value in changes.items())]
-    assert merge(different) == different
-    assert len(by_run(different)) == len(different)
-
-
 def test_one_episode_in_two_environments_is_refused() -> None:
     with pytest.raises(UserError, match="seeds 540000 and 1"):
         merge([record(), record(seed=1)])
@@ -142,12 +116,6 @@ def test_a_run_of_two_step_limits_is_refused() -> None:
         by_run([record(), record(episode=1, max_steps=300)])
 
 
-def test_errors_are_retried_by_default() -> None:
-    records = [record(), record(episode=1, outcome="error"), record(episode=2, outcome="timeout")]
-    assert finished(records) == {EpisodeKey("BinFill", 0), EpisodeKey("BinFill", 2)}
-    assert finished(records, retry_errors=False) == {EpisodeKey("BinFill", e) for e in range(3)}
-
-
 def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     settings = {"checkpoint": 100, "seeds": (7, 42), "env": {"split": "test", "max_steps": 1300}}
     first = claim_run(tmp_path, settings, notes={"device": "cpu"})
@@ -156,10 +124,6 @@ def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"env.max_steps was 1300, is 300; extra was 'not set', is 1"):
         claim_run(tmp_path, other)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
-
-
-def test_a_fingerprint_does_not_depend_on_the_order_of_keys() -> None:
-    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1}) != fingerprint({"a": 1, "b": 3})
 
 
 def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:

@@ -1,11 +1,9 @@
 """A whole run: killed and gone on with, dying workers, shards, videos, the command."""
 
-import importlib.util
 import signal
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,23 +11,17 @@ from helpers import commands
 from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
-from mme_vla.cli.evaluate import choose_device
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import (
     Shard,
-    checkpoint_label,
-    choose_episodes,
     choose_shard,
-    default_output,
-    memory_budget,
 )
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import Claims, find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch
-from mme_vla.utils.media import BORDER, RED, video_frame
 
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -183,34 +175,6 @@ def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:
             choose_shard(wrong, {})
 
 
-def test_a_process_of_torchrun_takes_its_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
-    monkeypatch.setenv("LOCAL_RANK", "3")
-    assert choose_device("auto") == torch.device("cuda", 3)
-    assert choose_device("cuda:1") == torch.device("cuda", 1)
-    assert choose_device("cpu") == torch.device("cpu")
-
-
-def test_episodes_are_selected_by_name_number_or_list() -> None:
-    assert choose_episodes("StopCube", 2) == [Job("StopCube", "test", 0), Job("StopCube", "test", 1)]
-    assert [job.episode for job in choose_episodes(["StopCube"], [4, 1])] == [4, 1]
-    for tasks, episodes, message in (
-        ("StopCubes", None, "StopCube"), ([], None, "at least one"), (["BinFill", "BinFill"], None, "once"),
-        ("BinFill", 51, "has 50"), ("BinFill", [50], "0 to 49"), ("BinFill", [1, 1], "once"),
-        ("BinFill", "x", "not understood"),
-    ):  # fmt: skip
-        with pytest.raises(UserError, match=message):
-            choose_episodes(tasks, episodes)
-
-
-def test_impossible_settings_are_refused_by_name() -> None:
-    for wrong in ({"workers": 0}, {"execute": 0}, {"max_steps": 1.5}, {"split": "tset"}, {"env": "robome"},
-                  {"video": "some"}, {"timeout_s": 0}, {"env": "official", "render": False}):  # fmt: skip
-        with pytest.raises(UserError, match=next(iter(wrong))):
-            RolloutSettings(**wrong)
-
-
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job, **how):
@@ -248,23 +212,6 @@ def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp
     assert list(failed.iterdir()) == []
 
 
-def test_a_caption_stands_below_the_images() -> None:
-    front, wrist = np.zeros((64, 64, 3), np.uint8), np.full((64, 64, 3), 9, np.uint8)
-    bare, captioned = (video_frame([front, wrist], text) for text in (None, "press the button"))
-    assert bare.shape == (88, 128, 3) and np.array_equal(bare[:64], captioned[:64])
-    assert captioned[64:].max() > 200 and bare[64:].max() == 0
-    demo = video_frame([front, wrist], video=True)
-    assert (demo[:BORDER, :128] == RED).all() and (demo[BORDER : 64 - BORDER, BORDER : 128 - BORDER].max() <= 9)
-
-
-def test_runs_find_their_folder_by_what_they_are() -> None:
-    assert checkpoint_label("runs/a/checkpoints/step_000350") == 350
-    assert checkpoint_label("owner/pi05") == "pi05" and checkpoint_label(None) == "untrained"
-    assert str(default_output(FACTS)) == "outputs/evaluation/tiny/untrained/seed42"
-    assert memory_budget(quick_policy("framesamp_modul", memory={"budget": 64})) == 64
-    assert memory_budget(quick_policy("framesamp_modul")) is memory_budget(quick_policy("pi05")) is None
-
-
 def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.CaptureFixture) -> None:
     def record(outcome: str, **changes) -> EpisodeRecord:
         return EpisodeRecord("m", 1, 0, "BinFill", 0, 1, "easy", outcome, 5, **changes)
@@ -275,18 +222,3 @@ def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.Capt
         progress.episode(record("error", error="it died"))
         assert progress.summary == "success 1/3 = 33.3 % · 1 errors"
     assert "tried again" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    importlib.util.find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed"
-)
-def test_the_command_evaluates_a_checkpoint_in_the_simulator(checkpoint: Path, tmp_path: Path) -> None:
-    words = [f"checkpoint={checkpoint}", "tasks=[StopCube]", "episodes=1", "max_steps=16", "render=false", "seed=7"]
-    done = commands.run("mme_vla.evaluate", *words, f"output={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    (record,) = read_records(tmp_path / "episodes.jsonl")
-    assert (record.model, record.checkpoint, record.model_seed) == ("framesamp_modul", 3, 7)
-    assert (record.outcome, record.steps, record.memory_budget) == ("timeout", 17, 64)
-    assert record.seconds.sim > 0 and record.seconds.policy > 0
-    assert "timeout" in done.stdout and "mme_vla.results" in done.stderr

@@ -11,24 +11,18 @@ import torch
 from torch import Tensor
 
 from helpers.h5_files import write_file
-from mme_vla.data.cache import VisionCache, fingerprint
+from mme_vla.data.cache import fingerprint
 from mme_vla.data.cache_building import build_cache
 from mme_vla.data.convert import convert
-from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.envs import metadata
-from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
-from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records, read_run
+from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run
 from mme_vla.memory.tokendrop import TokenDrop
-from mme_vla.play.game import Option
-from mme_vla.play.vlm_players import parse_choice
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.rows import RowDataset
 from mme_vla.subgoal.models.api import Api, Reply, Settings
-from mme_vla.subgoal.text import MalformedReply, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
-from mme_vla.utils import read_text, write_sums
+from mme_vla.utils import write_sums
 from mme_vla.utils.media import png_bytes, video_bytes
 
 
@@ -52,24 +46,6 @@ def write_recording(folder: Path) -> None:
     write_file(folder / H5, LENGTHS, videos=[VIDEO, VIDEO], size=SIDE)
 
 
-def read_recording(folder: Path) -> object:
-    """Every frame of every episode."""
-    read: list[object] = []
-    for ref in list_episodes(find_files([folder / H5])):
-        with open_episode(ref) as episode:
-            read += [ref.index, ref.task, episode.goals, episode.seed, episode.difficulty, episode.exec_start]
-            for frame in episode:
-                read += [
-                    frame.front,
-                    frame.wrist,
-                    frame.state,
-                    frame.action,
-                    frame.is_demo,
-                    sorted(frame.subgoals.items()),
-                ]
-    return digest(*read)
-
-
 def write_dataset(folder: Path) -> None:
     """The same as a LeRobot dataset with videos, without checksums."""
     work = folder / "recording"
@@ -78,25 +54,6 @@ def write_dataset(folder: Path) -> None:
     convert(list_episodes(find_files([work])), folder / "dataset")
     shutil.rmtree(work)
     (folder / "dataset" / "SHA256SUMS").unlink(missing_ok=True)
-
-
-def write_summed_dataset(folder: Path) -> None:
-    """The same with checksums."""
-    write_dataset(folder)
-    write_sums(folder / "dataset")
-
-
-def read_dataset(folder: Path) -> object:
-    """Every column and image, and the checksums as `inspect` compares them."""
-    source = EpisodeSource(folder / "dataset", name="fuzzed")
-    source.verify()
-    read: list[object] = [source.fps, source.lengths, source.exec_starts, source.subgoal_names]
-    for e in range(len(source)):
-        steps = range(int(source.lengths[e]))
-        read += [source.goal(e), source.task(e), source.states(e), source.actions(e)]
-        read += [sorted(source.subgoals(e, t).items()) for t in steps]
-        read += [source.frames(e, list(steps), view) for view in source.columns]
-    return digest(*read)
 
 
 class SyntheticSource:
@@ -136,19 +93,6 @@ def write_cache(folder: Path) -> None:
     build_cache(source, _memory(), _encode, folder / "cache", expected_fingerprint(), shard=(0, 1))
 
 
-def read_cache(folder: Path) -> object:
-    """Every token and score."""
-    source: Any = SyntheticSource()
-    cache = VisionCache(folder / "cache", source, expected_fingerprint())
-    read: list[object] = [cache.width]
-    for episode in range(len(source)):
-        history = cache.history(episode)
-        stored = cache.spec.stored_frames(len(history))
-        every = np.stack([np.repeat(stored, 4), np.tile(np.arange(4), len(stored))], axis=1)
-        read += [history.gather(every).view(torch.int16).numpy(), history.scores.frames, history.scores.values]
-    return digest(*read)
-
-
 def write_logs(folder: Path) -> None:
     """Records of five episodes and the settings of their run."""
     claim_run(folder, {"checkpoint": "a", "seed": 7, "tasks": ["PickXtimes"]}, {"device": "cpu"})
@@ -161,17 +105,6 @@ def write_logs(folder: Path) -> None:
                     seconds=Seconds(1.5, 0.25, 2.0), when="2026-01-01T00:00:00+00:00", extra={"score": 0.5},
                 )
             )  # fmt: skip
-
-
-def read_logs(folder: Path) -> object:
-    """The settings and notes, and every record."""
-    run = read_run(folder)
-    return digest(sorted(map(repr, run.items()))), tuple(map(repr, read_records(folder / RECORDS)))
-
-
-def is_shorter(valid: Any, result: Any) -> bool:
-    """A log cut after a whole line is that of a run that was stopped there: it continues with the missing episodes."""
-    return result[0] == valid[0] and result[1] == valid[1][: len(result[1])]
 
 
 QUESTION = ("You plan.", [("user", ["What next?"])])
@@ -192,33 +125,6 @@ def read_answers(folder: Path) -> object:
     """The kept answer; where it is damaged the question is asked again, and answered in the same words."""
     reply = _api(folder, "pick up the cube at <1, 2>").ask(*QUESTION)
     return reply.text, reply.input_tokens, reply.output_tokens
-
-
-ANSWERS = {
-    "subgoal.txt": "pick up the cube at <|box_start|>(250,500)<|box_end|> now",
-    "memer.json": '{"current_subtask": "open the drawer", "keyframe_positions": [1, 3]}',
-    "gemini.json": '{"reasoning": "so far", "subgoal": "press the button at <100, 250.5>"}',
-    "choice.json": '{"choice": "a", "point": [100, 900]}',
-}
-
-
-def write_replies(folder: Path) -> None:
-    """What models said."""
-    for name, text in ANSWERS.items():
-        (folder / name).write_text(text)
-
-
-def read_replies(folder: Path) -> object:
-    """What the predictors and players understand of it; they count what they cannot, and continue."""
-    replies = {name: read_text(folder / name, "an answer") for name in ANSWERS}
-    try:
-        return (
-            parse_subgoal(replies["subgoal.txt"]), parse_memer(replies["memer.json"], recent=8),
-            pixels_of_pairs(parse_gemini(replies["gemini.json"])),
-            parse_choice(replies["choice.json"], [Option("a", "pick", True)]),
-        )  # fmt: skip
-    except MalformedReply as error:
-        raise UserError(str(error)) from None
 
 
 class _Words:
@@ -265,8 +171,3 @@ def write_metadata(folder: Path) -> None:
     place = folder / "test" / "record_dataset_PickXtimes_metadata.json"
     place.parent.mkdir()
     place.write_text(json.dumps({"env_id": "PickXtimes", "record_count": 4, "records": records}))
-
-
-def read_metadata(folder: Path) -> object:
-    """Every episode."""
-    return tuple(map(repr, metadata.episodes("PickXtimes", "test", folder)))

@@ -8,6 +8,10 @@ from typing import Any
 
 import h5py
 import numpy as np
+from omegaconf import OmegaConf
+
+from mme_vla.config.composition import compose
+from mme_vla.embodiment import Embodiment
 
 
 @dataclass
@@ -117,3 +121,9 @@ def _add_depth(episode: h5py.Group, step: h5py.Group, size: int) -> None:
             focal, centre = 2.0 * size, size / 2
             intrinsic = np.array([[focal, 0, centre], [0, focal, centre], [0, 0, 1]], np.float32)
             episode[f"setup/{camera}_camera_intrinsic"] = intrinsic
+
+
+def robomme_robot(name: str, *words: str) -> Embodiment:
+    """The embodiment of that name, with changes of its configuration."""
+    section: Any = OmegaConf.to_container(compose("policy", [f"embodiment={name}", *words]).embodiment, resolve=True)
+    return Embodiment.from_dict(section)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.attention import PI05_VISIBILITY, Span, Visibility
+from mme_vla.backbone.layers import PI05_VISIBILITY, Span, Visibility
 from mme_vla.integration.base import MEMORY_VISIBILITY, memory_visibility
 
 OWN: Visibility = {

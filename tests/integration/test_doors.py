@@ -10,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.backbone.attention import PI05_VISIBILITY, Block
 from mme_vla.backbone.base import Hook
 from mme_vla.backbone.config import ExpertConfig
+from mme_vla.backbone.layers import PI05_VISIBILITY, Block
 from mme_vla.config.composition import compose
 from mme_vla.integration.base import Integration, required
 from mme_vla.memory.framesamp import FrameSamp
@@ -27,21 +27,6 @@ from mme_vla.weights.released import to_released
 
 SEEN = {"images", "prompt", "memory"}
 BESIDE = {**PI05_VISIBILITY, "memory": SEEN, "action": SEEN | {"action"}}
-
-
-class Conditioned(Integration):
-    """Joins the time condition."""
-
-    def __init__(self, backbone: Any) -> None:
-        super().__init__(backbone)
-        self.memory_width = backbone.action.width
-        self.mix = nn.Linear(self.memory_width, self.memory_width)
-
-    def condition(self, memory: MemoryTokens | None) -> Callable[[Tensor], Tensor]:
-        memory = required(memory)
-        valid = memory.mask[..., None]
-        change = self.mix(memory.tokens.masked_fill(~valid, 0).sum(1) / valid.sum(1))
-        return lambda condition: condition + change
 
 
 class Beside(Integration):
@@ -61,13 +46,6 @@ class Beside(Integration):
     def beside(self, memory: MemoryTokens | None) -> Sequence[Block]:
         memory = required(memory)
         return [Block("memory", self.own(memory.tokens), memory.mask, self.expert)]
-
-
-class BesideInTheVLM(Beside):
-    expert = "vlm"
-
-    def _width(self, backbone: Any) -> int:
-        return int(backbone.vlm.width)
 
 
 class BesideInAnExpertOfItsOwn(Beside):
@@ -132,7 +110,7 @@ class Another(FrameSamp):
         return MemoryTokens(self.encoder(history.features), history.mask)
 
 
-EXTENSION_POINTS = [Conditioned, Beside, BesideInTheVLM, BesideInAnExpertOfItsOwn, Everything]
+EXTENSION_POINTS = [Beside, BesideInAnExpertOfItsOwn, Everything]
 
 
 @pytest.fixture(autouse=True)

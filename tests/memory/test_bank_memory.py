@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from mme_vla import UserError, build_policy
 from mme_vla.memory.extensions.bank import CONSOLIDATIONS, MemoryBank
 from mme_vla.testing.check_memory import check_memory
 from mme_vla.testing.small import random_batch, small_policy
@@ -45,10 +44,3 @@ def test_bank_modul_answers_by_what_it_remembers() -> None:
     loss.backward()
     learned = {name for name, p in policy.memory.named_parameters() if p.grad is not None and p.grad.abs().sum() > 0}
     assert {"reduce.weight", "output.weight", "bank.gate.weight", "bank.blocks.0.value.weight"} <= learned
-
-
-def test_what_does_not_fit_is_refused_in_words() -> None:
-    with pytest.raises(UserError, match=r"budget=16 does not hold the 8×8 tokens"):
-        build_policy("bank_modul", memory={"budget": 16})
-    with pytest.raises(UserError, match=r"moments=4 must be .* more than memory.video=16"):
-        build_policy("bank_modul", memory={"moments": 4})

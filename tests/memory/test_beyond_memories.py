@@ -19,7 +19,6 @@ from mme_vla.memory.extensions.retrieval import Retrieval, chunks_of
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import motion_rows
-from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import (
     BEYOND,
     SMALL_VISION,
@@ -223,23 +222,6 @@ def test_past_frames_without_states_are_refused() -> None:
     assert episode.history is not None and len(episode.history) == 3
 
 
-def test_frames_that_could_not_be_taken_leave_no_motion_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    episode, frames = mover().start_episode("press the button"), moving_frames(4)
-    both, states = {"front": frames, "wrist": frames}, np.arange(32, dtype=np.float32).reshape(4, 8) / 32
-
-    def full(*_: object) -> None:
-        raise MemoryError("no room for these frames")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(episode.history, "take", full)
-        with pytest.raises(MemoryError, match="no room"):
-            episode.observe(both, states)
-    episode.observe(both, states)
-    assert torch.allclose(
-        episode.required_history().motion_rows(np.arange(4))[:, :8], torch.from_numpy(states), atol=1e-6
-    )
-
-
 # All of them
 
 SMALLER: dict[str, dict[str, Any]] = {
@@ -297,29 +279,6 @@ def test_in_bfloat16_it_computes_what_it_computes_in_float32(policy: MMEPolicy) 
         rounded = float(policy(batch, draws)[0])
         policy.compute_dtype = torch.float32
     assert rounded != exact and abs(rounded - exact) < 0.02 * exact
-
-
-def test_at_its_released_size_a_memory_keeps_the_budget_of_512(policy: MMEPolicy) -> None:
-    name = policy.config["memory"]["name"]
-    memory = MEMORIES.build({"name": name}, d_vision=96, width=8)
-    assert memory.budget <= 512
-    assert memory.capacity % memory.storage.grid**2 == 0
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "words"),
-    [
-        ("retrieval", {"cut": 2.0}, r"memory\.cut"), ("retrieval", {"budget": 500}, "512|496"),
-        ("retrieval", {"longest": 0}, r"memory\.longest"), ("moment", {"budget": 10}, "multiple of memory.moments"),
-        ("moment", {"heads": 7}, r"memory\.heads=7"), ("gist", {"budget": 96}, "choose at least 104"),
-        ("gist", {"recent": 0}, r"memory\.recent=0"), ("learned_topk", {"pool": 2}, r"memory\.pool=2"),
-        ("learned_topk", {"temperature": 0.0}, r"memory\.temperature"), ("actions", {"layers": 0}, r"memory\.layers"),
-        ("actions", {"max_steps": 0}, r"memory\.max_steps"),
-    ],
-)  # fmt: skip
-def test_sizes_that_do_not_fit_are_reported(name: str, options: dict[str, Any], words: str) -> None:
-    with pytest.raises(UserError, match=words):
-        MEMORIES.build({"name": name, **options}, d_vision=D, width=8)
 
 
 def test_an_episode_feels_and_does_what_a_dataset_says_it_did() -> None:

@@ -43,12 +43,6 @@ def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -
         lazy.gather(np.array([[4, 0]]))
 
 
-def test_a_waiting_frame_keeps_no_message_alive() -> None:
-    lazy, message = LazyHistory(SPEC, numbered), pictures(4)
-    lazy.take(FrameBatch.of(message), numbered)
-    assert all(not np.shares_memory(image, message) for image in lazy._waiting.values())
-
-
 @pytest.mark.parametrize("model", ["ttt_expert", "rmt_context"])
 def test_a_recurrent_policy_encodes_the_frames_it_reads_and_acts_as_ever(
     model: str, monkeypatch: pytest.MonkeyPatch
@@ -78,3 +72,12 @@ def test_a_recurrent_policy_encodes_the_frames_it_reads_and_acts_as_ever(
     eager, all_of_them = actions(policy)
     assert few < all_of_them / 4 and all_of_them == 40
     assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(lazy, eager, strict=True))
+
+
+def test_frame_batch_finds_rendered_images() -> None:
+    images = np.arange(3, dtype=np.uint8).repeat(12).reshape(3, 2, 2, 3)
+    batch = FrameBatch.of(images, np.array([1, 4, 6]), 8)
+    assert [frame for frame in range(8) if batch.image(frame) is not None] == [1, 4, 6]
+    assert (batch.select(np.array([4, 6])) == images[1:]).all()
+    full = FrameBatch.of(images)
+    assert full.length == 3 and full.index.tolist() == [0, 1, 2]

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.attention import apply_custom_positions, token_positions
+from mme_vla.backbone.layers import apply_custom_positions, token_positions
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing import check_integration

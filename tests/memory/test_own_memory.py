@@ -58,11 +58,6 @@ def test_its_file_makes_it_a_choice_for_any_integration_and_beside_another(monke
     assert [type(member).__name__ for member in policy.memory.memories] == ["LastFrames", "FrameSamp"]
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate", "serve", "cache", "probe", "inspect", "record"])
-def test_every_command_takes_the_plugins_of_its_file(command):
-    assert compose(command, ["memory=last_frames"], extra_dirs=[EXAMPLE / "configs"]).plugins == ["last_frames"]
-
-
 @pytest.mark.slow
 def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
     pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")

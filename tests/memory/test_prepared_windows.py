@@ -10,8 +10,6 @@ from helpers.recurrent_memories import MEMORIES, RandomHistory, same_memory, sma
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.serving_fakes import Served, acted_directly, course, observation, wait_until
 from mme_vla.envs.vector.pool import Job
-from mme_vla.memory.base import recurrent_frames
-from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.testing.small import moving_frames
 
@@ -92,16 +90,6 @@ def test_what_was_prepared_in_vain_does_no_harm(make):
         assert torch.equal(memory.encode([history], [stream]).tokens, now.tokens), "asked twice"
 
 
-@torch.no_grad()
-def test_a_growing_window_needs_nothing_prepared(make):
-    memory = make()
-    history, stream = RandomHistory(33), memory.start_stream()
-    memory.encode([history], [stream])
-    before = stream.updates
-    assert not memory.prepare(history, stream)
-    assert stream.updates == before
-
-
 def acted(policy, prepare: bool, chunks: int = 6) -> list[np.ndarray]:
     frames, results = moving_frames(16), []
     episode = policy.start_episode("press the button")
@@ -141,19 +129,6 @@ def test_policies_without_such_a_memory_have_nothing_to_prepare():
         episode.observe({"front": view, "wrist": view}, np.zeros((2, 8), np.float32))
         policy.act(episode, 1)
         assert not policy.prepare(episode)
-
-
-def test_a_longer_window_is_never_full_in_an_episode():
-    """What docs/evidence/performance.md offers: 128 frames hold the longest video and 1,300 frames of execution."""
-    longest = max(len(recurrent_frames(video + 1300, video, max_steps=1000)) for video in range(0, 1000, 7))
-    assert 64 < longest <= 128
-
-
-def test_a_memory_of_several_prepares_each():
-    members = [{"name": "framesamp", "budget": 64}, {"name": "ttt", "budget": 64, "max_steps": 4}]
-    policy = quick_policy("framesamp_ttt_modul", 8, memory={"members": members})
-    assert isinstance(policy.memory, JoinedMemory)
-    assert all(np.array_equal(a, b) for a, b in zip(acted(policy, True), acted(policy, False), strict=True))
 
 
 def test_preparing_waits_for_everybody_and_keeps_nobody():

@@ -16,8 +16,9 @@ from helpers.recurrent_memories import (
     small_memory,
     window,
 )
-from mme_vla import UserError, build_policy
-from mme_vla.memory.base import jittered, recurrent_frames, stack_history
+from mme_vla import UserError
+from mme_vla.memory.base import stack_history
+from mme_vla.memory.recurrent import jittered, recurrent_frames
 from mme_vla.memory.ttt import TTT
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 from mme_vla.types import HistoryTokens
@@ -165,14 +166,6 @@ def test_gradients_flow_through_every_step(make):
     assert (frames[~real] == 0).all()
 
 
-def test_layers_compile_without_breaks(make):
-    memory = make()
-    x, valid = torch.randn(2, 4, GRID**2, 16), torch.tensor([[False, True, True, True], [True] * 4])
-    compiled = torch.compile(memory.layer.advance, backend="eager", fullgraph=True)
-    actual, expected = (f(memory.init_state(2), x, valid)[0] for f in (memory.layer.advance, compiled))
-    assert all(torch.allclose(a, b, atol=TOLERANCE) for a, b in zip(actual, expected, strict=True))
-
-
 TTT_METRICS = [
     "inner_loss_before",
     "inner_loss_after",
@@ -252,33 +245,6 @@ def test_jitter_keeps_order_parts_and_the_current_frame():
         assert frames[0] >= 0
         assert (np.diff(frames) > 0).all()
         assert frames[-1] == step
-
-
-@torch.no_grad()
-def test_cosine_only_is_another_memory():
-    memory = MEMORIES["rmt"]()
-    torch.nn.init.normal_(memory.layer.q.weight)
-    torch.nn.init.normal_(memory.layer.kv.weight)
-    full = memory(window(memory, 100)).tokens
-    memory.layer.rotation = "cosine_only"
-    assert not torch.allclose(full, memory(window(memory, 100)).tokens, atol=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("model", "options", "message"),
-    [
-        ("rmt_modul", {"rotation": "sine"}, "cosine_only"),
-        ("rmt_modul", {"attention_dtype": "int8"}, "bfloat16"),
-        ("rmt_modul", {"heads": 3}, "even multiple of heads"),
-        ("ttt_modul", {"heads": 3}, "multiple of memory.heads=3"),
-        ("ttt_modul", {"max_rate": 0}, "above 0"),
-        ("ttt_modul", {"jitter": 8}, "memory.jitter=8"),
-        ("ttt_modul", {"chunk": 0}, "memory.chunk=0"),
-    ],
-)
-def test_options_that_cannot_be_are_refused(model, options, message):
-    with pytest.raises(UserError, match=message):
-        build_policy(model, memory=options)
 
 
 @pytest.mark.parametrize(("model", "constant"), [("ttt_modul", "ttt_base_lr_inv"), ("rmt_modul", "freqs_cis")])

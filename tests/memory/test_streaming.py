@@ -60,16 +60,6 @@ def test_nothing_later_than_the_step_decides(policy, frames):
     assert np.array_equal(a, b)
 
 
-def test_selections_respect_budget_and_time_order(policy, frames):
-    history = cached_history(policy, frames)
-    for step in range(0, FRAMES, 11):
-        selected = policy.memory.select(history, step)
-        assert len(selected) <= policy.memory.capacity
-        assert (np.diff(selected[:, 0]) >= 0).all()
-        assert selected[:, 0].max() <= step
-        assert len(np.unique(selected, axis=0)) == len(selected)
-
-
 def test_streaming_and_offline_give_the_same_actions(policy, frames):
     episode = feed(policy, frames)
     streamed = policy.act([episode])
@@ -108,12 +98,6 @@ def test_acting_adds_nothing_to_memory(policy, frames):
     policy.act([episode])
     policy.act([episode])
     assert len(episode.history) == before == 20
-
-
-def test_execution_start_is_the_length_of_the_video(policy, frames):
-    assert feed(policy, frames, demo=30, chunk=16).history.exec_start == 30
-    assert feed(policy, frames, demo=0, chunk=16).history.exec_start == 0
-    assert feed(policy, frames, demo=FRAMES - 1, chunk=FRAMES).history.exec_start == FRAMES - 1
 
 
 def test_episodes_refuse_what_they_cannot_use(policy, frames):

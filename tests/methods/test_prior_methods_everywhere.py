@@ -26,6 +26,7 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.recordings import all_recordings
 from mme_vla.evaluation.results.paper import average, counted, paper_method
 from mme_vla.policy.base import Policy
+from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.probing import lines
 from mme_vla.probing.arms import read_arms
 from mme_vla.probing.lines import MomentLine
@@ -112,14 +113,30 @@ def make_depth_env(task: str, split: str, episode: int, max_steps: int, **option
     return DepthEnv(task, episode, max_steps, 1e9, 0.0, "")
 
 
-@pytest.mark.parametrize("model", SHORT)
-def test_it_trains_and_goes_on_from_its_checkpoint(
-    model: str, trained: Callable[[str], Path], data: Callable[[str], str]
-) -> None:
-    folder = trained(model)
-    last = update(model, data(model), folder.parent / "unused", "train.steps=2", f"resume={folder}")
-    assert len(losses(folder)) == 2 and np.isfinite(losses(folder)).all()
-    assert last == folder / "checkpoints" / "step_000002"
+RESUMED = {
+    **{model: (model, []) for model in ("diffusion_policy", "openvla_oft", "memoryvla", "sam2act_plus")},
+    "decaying rates": ("diffusion_policy", ["train.schedule=cosine", "train.schedule_steps=3", "train.ema_warmup=true",
+                                            "train.warmup_from_zero=true", "train.warmup=1", "train.decay_min_dim=2"]),
+    "adapters": ("openvla_oft", ["finetune=oft", "finetune.rank=2"]),
+    "another optimizer": ("sam2act_plus", ["train.optimizer=lamb"]),
+    "a memory of frames": ("memoryvla", ["memory=framesamp", "memory.every=8", "processor.group_size=1"]),
+    "a recurrent memory": ("memoryvla", ["memory=ttt", "memory.grid=4"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", RESUMED)
+def test_it_trains_by_the_command_and_resumes_to_the_bit(case: str, data: Callable[[str], str], tmp_path: Path) -> None:
+    pytest.importorskip("diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines")
+    model, words = RESUMED[case]
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    straight = load_tensors(update(model, data(model), whole, *words, "train.steps=2"))
+    update(model, data(model), parts, *words, "train.steps=1")
+    last = update(model, data(model), tmp_path / "unused", *words, "train.steps=2", f"resume={parts}")
+    assert last == parts / "checkpoints" / "step_000002"
+    assert losses(parts) == losses(whole) and len(losses(parts)) == 2 and np.isfinite(losses(parts)).all()
+    resumed = load_tensors(last)
+    assert all(torch.equal(tensor, resumed[name]) for name, tensor in straight.items())
+    assert bool(Policy.from_pretrained(last).config.get("adapters")) == (case == "adapters")
 
 
 @pytest.mark.parametrize("model", SHORT)

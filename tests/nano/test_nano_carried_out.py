@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-import torch
 
-from helpers.nano_policies import demonstration, nano
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env
@@ -12,7 +10,6 @@ from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
 from mme_vla.nano.evaluating import Replay, replay
-from mme_vla.nano.learning import Decisions, statistics
 
 SCENE = {"seed": 3_000_001, "difficulty": "easy"}
 
@@ -33,24 +30,6 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> 
         observation, _, ended, _, info = env.step(target)
     env.close()
     assert ended and info["status"] == "success"
-
-
-def test_noise_is_in_what_is_learned_and_not_in_what_is_requested() -> None:
-    policy, made = nano().eval(), demonstration()
-    policy.require_processor().stats = statistics([made], policy)
-    exact, noisy = (Decisions.of(policy, [made], noise=noise) for noise in (0.0, 0.2))
-    torch.manual_seed(0)
-    batch, shifted = exact.collate([0, 1, 2]), noisy.collate([0, 1, 2])
-    assert batch.state is not None and shifted.state is not None and batch.history and shifted.history
-    for before, after, std in (
-        (batch.view_tokens, shifted.view_tokens, 0.2),
-        (batch.history.features, shifted.history.features, 0.2),
-        (batch.state[:, :-1], shifted.state[:, :-1], 0.01),
-    ):
-        assert before is not None and after is not None
-        assert (after - before).std().item() == pytest.approx(std, rel=0.5)
-    assert torch.equal(batch.state[:, -1], shifted.state[:, -1])
-    assert batch.actions is not None and torch.equal(batch.actions, shifted.actions)  # type: ignore[arg-type]
 
 
 def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:

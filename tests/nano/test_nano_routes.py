@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from helpers import REPOSITORY
 from mme_vla import UserError, build_policy
-from mme_vla.config.composition import compose
 from mme_vla.data.waypoints import Motions
-from mme_vla.embodiment import Embodiment
 from mme_vla.envs.recording.frames import DECISIONS as AT_DECISIONS
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy
@@ -77,12 +73,6 @@ def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are(
     assert not torch.equal(now.history.features, batch.history.features)
 
 
-def test_the_robot_of_routes_has_a_motion_for_each_half_of_the_longest_route() -> None:
-    robot = Embodiment.from_dict(dict(compose("policy", ["embodiment=robomme_waypoint_front_route"]).embodiment))
-    assert (robot.action.horizon, robot.action.execute, robot.action.space) == (14, 14, "waypoint")
-    assert robot.camera_names == ("front",)
-
-
 def step(number: int, video: int) -> SimpleNamespace:
     """A recorded step of an execution in which a motion takes two frames."""
     row = np.full(7, np.nan) if number < video else np.full(7, (number - video) // 2, np.float64)
@@ -95,12 +85,3 @@ def test_only_decisions_that_a_policy_is_requested_are_rendered(every: int, rend
     steps = [step(number, 3) for number in range(11)]
     selection = FrameChoice(AT_DECISIONS, None, every).render_request(steps)  # type: ignore[arg-type]
     assert set(selection.frames["front"]) == rendered
-
-
-def test_the_pages_figures_of_routes_follow_from_the_records() -> None:
-    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / "RouteStick"]))
-    won = {model: {r.episode for r in records if r.model.startswith(model) and r.success} for model in ROWS}
-    assert len(records) == 300 and {model: len(rows) for model, rows in won.items()} == ROWS
-    assert won["pi05"] < won["framesamp"]
-    page = (REPOSITORY / "docs" / "evidence" / "nano.md").read_text()
-    assert "| **73 %** (64 … 81) | 50/50 | 19/25 | 4/25 |" in page and "| 3 % (1 … 8) | 3/50 | 0/25 | 0/25 |" in page

@@ -33,7 +33,7 @@ def drawn_for(policy: MMEPolicy) -> Demonstration:
     return demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
 
 
-@pytest.mark.parametrize("memory", ["tokendrop", "ttt", "rmt"])
+@pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt"])
 def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
     policy = nano(f"{memory}_modul").eval()
     made = drawn_for(policy)

@@ -9,8 +9,7 @@ import torch
 from helpers.golden import error, load, params, vision_config
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.siglip import VisionTower, pool_grid
-from mme_vla.memory.base import make_scorer
-from mme_vla.memory.encoder import position_features
+from mme_vla.memory.base import make_scorer, position_features
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop, most_changed, ranked_patches

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.golden import error, load, params
-from mme_vla.memory.base import recurrent_frames
+from mme_vla.memory.recurrent import recurrent_frames
 from mme_vla.memory.rmt import RMTLayer
 from mme_vla.memory.ttt import TTTLayer
 from mme_vla.weights.names.jax_memory import layer_names, rotary_table

@@ -8,15 +8,25 @@ import torch
 
 from helpers.golden import error, load, params, vision_config
 from mme_vla.backbone import flow
-from mme_vla.backbone.attention import Span, additive_mask, attend, attention_mask, token_positions
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.gemma import JointBlock
-from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, rms_normalise, rotate, rotation
+from mme_vla.backbone.layers import (
+    AdaRMSNorm,
+    RMSNorm,
+    Span,
+    additive_mask,
+    attend,
+    attention_mask,
+    rms_normalise,
+    rotate,
+    rotation,
+    token_positions,
+)
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.integration.base import MEMORY_VISIBILITY
 from mme_vla.integration.modulator import ModulatorLayer
+from mme_vla.memory.base import FeatureEncoder, position_features
 from mme_vla.memory.base import token_positions as patch_positions
-from mme_vla.memory.encoder import FeatureEncoder, position_features
 from mme_vla.weights.tables import Piece, linear, prefixed, read
 
 TOLERANCE = 1e-4

@@ -151,13 +151,6 @@ def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_pa
     assert not is_local("0.0.0.0")
 
 
-def test_an_address_that_cannot_be_had_is_refused():
-    with listen("127.0.0.1", 0) as taken, pytest.raises(UserError, match="Cannot listen"):
-        listen("127.0.0.1", taken.getsockname()[1])
-    with pytest.raises(UserError, match="port=99999"):
-        listen("127.0.0.1", 99999)
-
-
 @pytest.mark.slow
 def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
     script = (
@@ -253,58 +246,6 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
     first, second = read_records(tmp_path / "run" / "episodes.jsonl")
     assert [d["point"] for d in first.extra["decisions"]] == [[180, 190], [67, 68]]
     assert (first.outcome, second.outcome, second.error) == ("success", "error", "no path")
-
-
-@pytest.mark.slow
-def test_the_keys_work_with_the_focus_on_the_slider_or_the_speed(tmp_path):
-    with served(tmp_path / "run") as page, Browser(tmp_path / "profile") as browser:
-        pressed = "document.querySelector('.option[data-label=\"{}\"]').getAttribute('aria-pressed') === 'true'"
-        browser.open(f"http://127.0.0.1:{page.port}/")
-        browser.wait("document.querySelectorAll('.option:not(:disabled)').length === 3")
-        browser.wait("document.querySelector('#badge').innerText === 'Present'")
-        browser.click("#seek")  # with the mouse: the keys are the page's again
-        browser.wait("document.activeElement === document.body")
-        assert browser.text("#badge") == "Conditioning video"
-        browser.run("document.querySelector('#seek').focus()")
-        at = browser.run("Number(document.querySelector('#seek').value)")
-        browser.press("ArrowRight")  # the slider's own: one frame, not two
-        browser.wait(f"document.querySelector('#place').innerText.startsWith('{at + 2} /')")
-        for name, letter in (("seek", "b"), ("speed", "c")):
-            browser.run(f"document.querySelector('#{name}').focus()")
-            browser.press(letter)
-            browser.wait(pressed.format(letter))
-            browser.press("Escape")
-            browser.wait("!document.querySelector('.option[aria-pressed=true]')")
-        browser.run("document.querySelector('#seek').focus()")
-        browser.press(" ")
-        browser.wait("document.querySelector('#toggle').innerText === 'Pause'")
-        browser.press("b")
-        browser.press("Enter")
-        browser.wait("document.querySelectorAll('#history li').length === 1")
-        assert browser.problems == []
-
-
-def test_the_state_survives_a_session_that_goes_while_it_is_read(tmp_path):
-    class Vanishing(Desk):
-        """Its session is gone, and the episode played, after the first look."""
-
-        n_reads = 0
-
-        @property
-        def session(self):
-            self.n_reads += 1
-            return a_session() if self.n_reads == 1 else None
-
-        @session.setter
-        def session(self, _):
-            pass
-
-    with PlayRun(tmp_path, [an_episode()], Identity("human", "anna", 0, 1300, {}), lambda _: a_session()) as run:
-        desk = Vanishing(run, "anna")
-        try:
-            assert desk.state()["task"] == "VideoUnmask"
-        finally:
-            desk.close()
 
 
 @pytest.mark.slow

@@ -9,13 +9,12 @@ import pytest
 
 from helpers.play_fakes import BLOCKS, MOTION, VIDEO, BlocksEnv, a_session, an_episode
 from mme_vla.cli.play import _by_itself, line, print_summary
-from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import read_records
-from mme_vla.play import ChoiceSession, RandomPlayer, Reveal
+from mme_vla.play import ChoiceSession, RandomPlayer
 from mme_vla.play.players import play
-from mme_vla.play.run import Identity, PlayRun, choose_episodes
+from mme_vla.play.run import Identity, PlayRun
 
 
 def press(name):
@@ -33,32 +32,6 @@ def test_the_video_comes_first_then_the_frames_of_each_motion():
     assert session.frame is second.frames[-1]
     assert session.n_displayed_frames == VIDEO + 1 + MOTION
     assert session.steps == MOTION
-
-
-def test_an_episode_without_video_begins_with_the_scene():
-    session = a_session(video=False)
-    first = session.start()
-    assert (first.title, len(first.frames)) == ("The scene", 1)
-
-
-def test_the_episode_ends_with_the_environments_status():
-    for second, outcome in (("red", "success"), ("blue", "fail")):
-        session = a_session()
-        session.start()
-        session.choose(press("blue"))
-        assert not session.over
-        session.choose(press(second))
-        assert session.status == outcome
-        with pytest.raises(UserError, match=f"over \\({outcome}\\)"):
-            session.choose(press("red"))
-
-
-def test_a_choice_that_moves_nothing_reveals_nothing_and_the_present_image_stays():
-    session = a_session()
-    frame = session.start().frames[-1]
-    assert session.choose({"choice": " B "}) == Reveal("wait", [], VIDEO + 1)
-    assert session.frame is frame
-    assert session.steps == 0
 
 
 def test_a_player_that_never_gets_on_is_timed_out():
@@ -128,8 +101,6 @@ def test_an_environment_of_another_kind_is_refused():
         ChoiceSession(Blind(), an_episode()).start()
     with pytest.raises(UserError, match="multi_choice"):
         ChoiceSession(Other(), an_episode()).start()
-    with pytest.raises(UserError, match="max_choices is 0"):
-        a_session(max_choices=0)
     blind = ChoiceSession(Blind(), an_episode(), images=False)
     assert len(blind.start().frames) == VIDEO + 1
     assert not blind.frame.any()
@@ -205,12 +176,6 @@ def test_own_tasks_are_summed_up_beside_the_benchmarks(tmp_path, capsys):
     assert "TwoButtons" in capsys.readouterr().out
 
 
-def test_a_run_of_other_settings_needs_another_folder(tmp_path):
-    a_run(tmp_path).__exit__(None, None, None)
-    with pytest.raises(UserError, match="max_choices"):
-        a_run(tmp_path, max_choices=3)
-
-
 def test_an_error_is_played_again_only_when_requested(tmp_path):
     with a_run(tmp_path, [0]) as run:
         session = run.make(run.todo[0])
@@ -222,48 +187,6 @@ def test_an_error_is_played_again_only_when_requested(tmp_path):
         identity = run.identity
     with PlayRun(tmp_path, [an_episode()], identity, lambda _: a_session(), retry_errors=True) as run:
         assert run.todo == [an_episode()]
-
-
-def test_episodes_are_named_in_several_ways():
-    def numbers(episodes, split="test"):
-        return [which.episode for which in choose_episodes("BinFill", episodes, split)]
-
-    assert numbers(3) == [0, 1, 2]
-    assert numbers([3]) == [3]
-    assert numbers([4, 2]) == [4, 2]
-    assert numbers("0-2,7") == numbers(["0-2", 7]) == [0, 1, 2, 7]
-    assert numbers("all", "train") == list(range(100))
-    assert [which.task for which in choose_episodes("BinFill, MoveCube", 1, "test")] == ["BinFill", "MoveCube"]
-    every = choose_episodes("all", "0-49", "test")
-    assert len(every) == 800
-    assert {which.task for which in every} == set(TASK_NAMES)
-    known = choose_episodes("VideoUnmask", [3], "test")[0]
-    assert (known.seed, known.difficulty) == (560300, "hard")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("BinFil", 1, "test"), "Unknown task 'BinFil'.*BinFill"),
-        (("BinFill", 1, "tset"), "Unknown split 'tset'.*test"),
-        (("BinFill", [50], "test"), "no episode 50 in BinFill in 'test', which has 50: 0 to 49"),
-        (("BinFill", "5-2", "test"), "ends before it begins"),
-        (("BinFill", "some", "test"), "not understood"),
-        (("BinFill", -1, "test"), "first -1; .* has 50"),
-        (("BinFill", "0-999999999", "test"), "no episode 999999999"),
-        ((["BinFill"], [], "test"), "at least one"),
-    ],
-)
-def test_episodes_that_are_not_there_are_refused(words, message):
-    with pytest.raises(UserError, match=message):
-        choose_episodes(*words)
-
-
-def test_records_of_runs_below_the_folder_are_excluded(tmp_path):
-    with a_run(tmp_path / "below") as other:
-        other.save(play(other.make(other.todo[0]), RandomPlayer()))
-    with a_run(tmp_path) as run:
-        assert (run.records, [which.episode for which in run.todo]) == ([], [0, 1])
 
 
 class Collapsing(BlocksEnv):

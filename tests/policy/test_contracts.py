@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.attention import PI05_VISIBILITY
+from mme_vla.backbone.layers import PI05_VISIBILITY
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.config.composition import config_dir
 from mme_vla.integration.context import Context

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.policy.tensor_files import load_tensors, save_tensors
+from mme_vla.policy.tensor_files import save_tensors
 from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
 from mme_vla.training.optim import EMA
@@ -153,13 +153,6 @@ def test_thousands_of_names_are_one_short_paragraph(checkpoint: Path) -> None:
     assert "2,000 unexpected" in refusal(MMEPolicy.from_pretrained, checkpoint)
     save_file({f"{'x' * 200}{i}": torch.zeros(1) for i in range(2000)}, checkpoint / "raw.safetensors")
     refusal(resume, checkpoint)
-
-
-def test_a_shard_with_a_name_of_thousands_of_letters_is_one_short_paragraph(tmp_path: Path) -> None:
-    (tmp_path / "model.safetensors.index.json").write_text(json.dumps({"weight_map": {"a": "x" * 5000}}))
-    with pytest.raises(UserError) as refused:
-        load_tensors(tmp_path)
-    assert len(str(refused.value)) < 1000
 
 
 def test_moments_that_are_no_numbers_are_refused(checkpoint: Path) -> None:

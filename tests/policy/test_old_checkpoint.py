@@ -2,18 +2,15 @@
 
 import json
 import shutil
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from rich.console import Console
 
 from data.before_the_rooms.make import actions
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy
-from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
 
@@ -26,13 +23,6 @@ def test_it_loads_and_chooses_the_same_actions() -> None:
     policy = MMEPolicy.from_pretrained(FOLDER / "run" / STEP)
     assert policy.embodiment.name == "robomme_joint", "what checkpoints that name no robot are for"
     np.testing.assert_allclose(actions(policy, ("front", "wrist")), EXPECTED["actions"], atol=2e-5)
-
-
-def test_it_is_inspected() -> None:
-    console = Console(record=True, width=160, file=StringIO())
-    show_checkpoint(FOLDER / "run", console)
-    output = console.export_text()
-    assert "framesamp_modul" in output and "step_000002" in output
 
 
 def test_its_training_goes_on_with_the_losses_it_had(tmp_path: Path) -> None:

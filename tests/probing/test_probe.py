@@ -81,9 +81,9 @@ def test_interventions_on_entries_are_refused_where_there_are_none() -> None:
     ("word", "message"),
     [
         ("shufle", "Unknown intervention 'shufle'. Did you mean 'shuffle'?"),
-        ("nodemo:3", "the intervention nodemo has no dial"),
-        ("drop:x", "the dial count of drop is a whole number"),
-        ("drop:0", "drop.count=0 must be a whole number, at least 1"),
+        ("nodemo:3", "nodemo, which has no dial"),
+        ("drop:x", "write drop:<count>, a whole number"),
+        ("drop:0", "drop.count=0 must be a whole number, 1 or more"),
         ({"name": "drop", "which": "old"}, "drop.which='old'. Did you mean 'oldest'?"),
         (7, "with=7"),
     ],

@@ -10,7 +10,6 @@ from helpers.probe_fakes import made_up
 from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
-from mme_vla.evaluation.feed import Feed
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
@@ -111,23 +110,6 @@ def test_a_pause_is_a_frame_repeated() -> None:
     recording.show(episode, 0, 37)
     assert isinstance(episode.inner.history, OnlineHistory)
     assert (len(episode.inner.history), episode.n_observed_frames) == (43, 37)
-
-
-@pytest.mark.parametrize("video", [True, False])
-@pytest.mark.parametrize(("stills", "at"), [(0, 0), (5, 0), (5, 7)])
-def test_frames_find_their_way_through_a_feed_and_back(video: bool, stills: int, at: int) -> None:
-    feed, stills_, before = Feed(video=video, stills=stills, at=at), np.arange(40), 11
-    indices = feed.displayed(stills_, 12, before)
-    remaining = stills_[indices >= 0]
-    assert np.array_equal(remaining, stills_ if video else stills_[12:])
-    assert (np.diff(indices[indices >= 0]) >= 1).all() and indices[-1] == before + (40 if video else 28) - 1 + stills
-    assert all(
-        feed.source_frames(np.array([place]), 12, before).tolist() == [frame]
-        for place, frame in zip(indices[remaining], remaining, strict=True)
-    )
-    still = feed.displayed(np.array([12 + at]), 12, before)[0]
-    assert feed.source_frames(np.arange(still - stills, still + 1), 12, before).tolist() == [12 + at]
-    assert feed.source_frames(np.arange(before), 12, before).size == 0
 
 
 def test_a_memory_stored_where_chunks_are_selected_sees_no_pause() -> None:

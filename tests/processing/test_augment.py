@@ -27,15 +27,6 @@ def test_same_generator_gives_same_images_and_another_seed_others() -> None:
     assert not torch.equal(augmented(images), augmented(images, seed=8))
 
 
-def test_range_shape_and_input_are_unchanged() -> None:
-    images = pictures().half()
-    before = images.clone()
-    result = augmented(images)
-    assert result.shape == images.shape and result.dtype == torch.float32
-    assert result.min() >= -1 and result.max() <= 1
-    assert torch.equal(images, before)
-
-
 def test_wrist_views_are_never_shifted_and_half_of_them_not_touched() -> None:
     images = pictures(batch=200, size=8)
     result = augmented(images)
@@ -53,24 +44,11 @@ def test_both_views_of_a_sample_share_their_colours() -> None:
     assert len({tuple(row) for row in middle[:, 1].mul(1e4).round().tolist()}) > 10
 
 
-def test_samples_do_not_depend_on_their_neighbours_images() -> None:
-    images = pictures()
-    changed = images.clone()
-    changed[1:] = 0
-    assert torch.equal(augmented(images)[0], augmented(changed)[0])
-
-
 def test_no_rotation_and_no_offset_is_the_centre_crop() -> None:
     ramp = torch.linspace(0, 1, 40).expand(1, 1, 3, 40, 40)
     zoomed = crop_and_rotate(ramp, torch.zeros(1, 2), torch.zeros(1))
     expected = torch.linspace(-1, 1, 40) * (38 / 40) * 0.5 + 0.5
     assert torch.allclose(zoomed[0, 0, 0, 20], expected, atol=1e-6)
-
-
-def test_extreme_offset_reaches_exactly_the_border_of_the_image() -> None:
-    bright = torch.ones(1, 1, 3, 40, 40)
-    corner = crop_and_rotate(bright, torch.ones(1, 2), torch.zeros(1))
-    assert corner.min() > 0.95  # no black is pulled in beyond the half pixel at the rim
 
 
 def test_rotation_fills_the_corners_with_black() -> None:

@@ -99,25 +99,11 @@ def test_quantiles_map_to_the_ends_and_nothing_is_clipped() -> None:
     assert torch.allclose(normalize(ends, stats), expected, atol=1e-4)
 
 
-def test_dimensions_beyond_the_statistics_pass_through() -> None:
-    x = torch.randn(2, 5, 12)
-    assert torch.equal(normalize(x, made_up_stats())[..., 8:], x[..., 8:])
-    assert torch.allclose(unnormalize(normalize(x, made_up_stats()), made_up_stats()), x, atol=1e-5)
-
-
 def test_normalisation_refuses_values_the_statistics_do_not_fit() -> None:
     with pytest.raises(UserError, match="8 dimensions"):
         normalize(torch.zeros(3, 7), made_up_stats())
     with pytest.raises(UserError, match="int64"):
         normalize(torch.zeros(3, 8, dtype=torch.int64), made_up_stats())
-
-
-def test_only_the_joints_are_relative_to_the_state() -> None:
-    actions, state = torch.randn(4, 20, 8), torch.randn(4, 8)
-    deltas = ROBOMME_JOINT.action.to_relative(actions, state)
-    assert torch.equal(deltas[..., 7:], actions[..., 7:])
-    assert torch.allclose(deltas[2, 13, :7], actions[2, 13, :7] - state[2, :7])
-    assert torch.allclose(ROBOMME_JOINT.action.to_absolute(deltas, state), actions, atol=1e-6)
 
 
 def test_statistics_survive_their_file(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """One object takes raw data to the network and back, and comes out of its folder unchanged."""
 
 import json
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -85,20 +84,6 @@ def test_processor_comes_out_of_its_folder_unchanged(tmp_path: Path, with_stats:
     assert loaded.embodiment == saved.embodiment and loaded.prompt_name == "subgoal"
     assert (loaded.stats and loaded.stats.to_dict()) == (saved.stats and saved.stats.to_dict())
     assert torch.equal(loaded.prompt("a", "b")[0], saved.prompt("a", "b")[0])
-
-
-def test_saved_folder_can_move_and_be_saved_again(tmp_path: Path) -> None:
-    processor().save(tmp_path / "first")
-    (tmp_path / "first").rename(tmp_path / "moved")
-    Processor.load(tmp_path / "moved").save(tmp_path / "second")
-    assert Processor.load(tmp_path / "second").tokenizer.fingerprint == Tokenizer.load("sample").fingerprint
-    assert str(tmp_path) not in (tmp_path / "second" / "processor.json").read_text()
-
-
-def test_processor_travels_to_worker_processes() -> None:
-    proc = processor()
-    copy = pickle.loads(pickle.dumps(proc))
-    assert torch.equal(copy.prompt("press it")[0], proc.prompt("press it")[0])
 
 
 def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None:

@@ -43,12 +43,6 @@ def test_pieces_are_the_golden_ones(parity: Path) -> None:
         assert [list(piece) for piece in pieces] == case["encoded_pieces"]
 
 
-def test_goal_prompt_is_the_goal_and_a_separate_newline(tokenizer: Tokenizer) -> None:
-    ids, mask = encode_prompt(PROMPTS["plain"](), tokenizer, PromptInput(" pick_up the cube\n"), 64)
-    expected = tokenizer.encode("pick up the cube", bos=True) + tokenizer.encode("\n", bos=False)
-    assert ids[mask].tolist() == expected
-
-
 def test_prompt_is_padded_on_the_right_with_zeros(tokenizer: Tokenizer) -> None:
     ids, mask = encode_prompt(PROMPTS["plain"](), tokenizer, PromptInput("press the button"), 16)
     length = int(mask.sum())
@@ -82,15 +76,3 @@ def test_a_missing_state_is_refused() -> None:
 
 def test_state_levels_span_the_clipped_range() -> None:
     assert discretize(np.array([-9.0, -1.0, 0.0, 1.0, 9.0])) == [0, 0, 128, 255, 255]
-
-
-def test_formats_say_what_they_read() -> None:
-    reads = {name: (PROMPTS[name].reads_subgoal, PROMPTS[name].reads_state) for name in PROMPTS}
-    assert reads["plain"] == (False, False)
-    assert reads["state"] == (False, True)
-    assert reads["subgoal"] == reads["subgoal_sentence"] == (True, False)
-
-
-def test_an_unknown_format_suggests_near_names() -> None:
-    with pytest.raises(UserError, match="'subgoal'"):
-        PROMPTS["subgaol"]

@@ -59,11 +59,6 @@ def test_an_incomplete_last_batch_is_left_out_as_released(data, monkeypatch) -> 
     assert counts == [16] * 6  # 58 steps: three batches of states and of chunks
 
 
-def test_the_same_data_give_the_same_statistics(data) -> None:
-    source, _ = data
-    assert compute_norm_stats([source]).to_dict() == compute_norm_stats([source]).to_dict()
-
-
 def test_no_data_is_an_error(data) -> None:
     with pytest.raises(UserError, match="at least two execution steps"):
         compute_norm_stats([data[0]], [np.zeros(0, np.int64)])

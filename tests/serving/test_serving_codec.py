@@ -45,31 +45,20 @@ def test_every_dtype_that_is_sent_comes_back(dtype):
         assert np.array_equal(back, sent) and np.shape(back) == np.shape(sent)
 
 
-def test_decoded_arrays_are_views_that_refuse_writing():
-    array = unpack(pack(ARRAY))
-    with pytest.raises(ValueError, match="read-only"):
-        array[0] = 1
-
-
 @pytest.mark.parametrize("value", [np.array([1j]), np.array([object()]), np.zeros(2, "i4,f4"), object(), {"x": {1}}])
 def test_records_objects_and_complex_numbers_are_not_sent(value):
     with pytest.raises(UserError, match="cannot be encoded"):
         pack(value)
 
 
-@pytest.mark.parametrize("dtype", ["|O", "<c8", "|V4", "i4,f4", "nonsense", 7, None, "f" * 99])
-def test_such_dtypes_are_refused_when_received(dtype):
-    with pytest.raises(UserError, match="dtype"):
-        unpack(raw_array(dtype=dtype))
-
-
 @pytest.mark.parametrize(
     "changes",
     [{"shape": [3, 2]}, {"shape": [-2, -2]}, {"shape": "ab"}, {"shape": [2.0, 2]}, {"data": b""}, {"data": "text"},
-     {"shape": [0, 2**62], "data": b""}, {"shape": [2**40, 2**40]}, {"shape": [1] * 40}, {"shape": [True, 4]}],
+     {"shape": [0, 2**62], "data": b""}, {"shape": [2**40, 2**40]}, {"shape": [1] * 40}, {"shape": [True, 4]},
+     *({"dtype": dtype} for dtype in ("|O", "<c8", "|V4", "i4,f4", "nonsense", 7, None, "f" * 99))],
 )  # fmt: skip
 def test_an_array_that_is_not_what_it_says_is_refused(changes):
-    with pytest.raises(UserError, match=r"array|shape|bytes"):
+    with pytest.raises(UserError, match=r"array|shape|bytes|dtype"):
         unpack(raw_array(**changes))
 
 
@@ -152,19 +141,9 @@ def test_a_missing_key_is_named(key):
 
 @pytest.mark.parametrize(
     "message",
-    [
-        None,
-        [],
-        3,
-        {},
-        {"reset": False},
-        {"reset": "yes"},
-        {b"reset": True},
-        {"add_buffer": True},
-        {"add_buffer": False},
-        {"observation/image": PICTURE},
-    ],
-)
+    [None, [], 3, {}, {"reset": False}, {"reset": "yes"}, {b"reset": True}, {"add_buffer": True},
+     {"add_buffer": False}, {"observation/image": PICTURE}],
+)  # fmt: skip
 def test_what_is_no_request_is_refused(message):
     with pytest.raises(UserError):
         parse(message, 10)

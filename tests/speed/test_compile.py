@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
 
 from mme_vla.backbone.base import Hook, LayerHooks, bind_hook
 from mme_vla.policy.mme import MMEPolicy
@@ -71,20 +70,6 @@ def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
     validation.loss(policy)
     assert after_one == counted.graphs <= MOST_GRAPHS, "other lengths, batches and validation need no code of their own"
     assert counted.graphs >= 3, "the tower, a layer, and the last layer"
-
-
-def test_what_cannot_be_fully_compiled_is_an_error_and_not_slow() -> None:
-    policy = small_policy("pi05", **SHORT_TOWER, policy={"augment": False})
-    policy.compile(backend=Counted())
-    policy.backbone.transformer.layers[0].experts["vlm"].mlp = Printing()
-    with pytest.raises(torch._dynamo.exc.Unsupported):
-        policy(batch_of(policy, 2, 16, 8))
-
-
-class Printing(nn.Module):
-    def forward(self, x: Tensor) -> Tensor:
-        torch._dynamo.graph_break()
-        return x
 
 
 def test_a_hook_of_layers_answers_as_one_of_numbers() -> None:

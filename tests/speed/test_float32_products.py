@@ -58,14 +58,6 @@ def test_recurrent_layers_alone_see_it_the_recomputed_ones_too(
     assert set(precisions) == {outside} and switches() == outside
 
 
-def test_on_a_cpu_it_changes_no_number() -> None:
-    chunks = []
-    for how in ("ieee", "tf32"):
-        policy = small_policy("rmt_modul", **{"+policy": {"float32_products": how}}).eval()
-        chunks.append(policy.sample_actions(random_batch(policy, 2), torch.zeros(2, 20, 32), steps=2))
-    assert torch.equal(*chunks)
-
-
 def test_an_unknown_way_is_refused() -> None:
     with pytest.raises(UserError, match=r"float32_products='tf23'.*Did you mean 'tf32'"):
         small_policy("ttt_modul", **{"+policy": {"float32_products": "tf23"}})

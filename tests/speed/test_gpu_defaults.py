@@ -8,8 +8,6 @@ import torch
 from mme_vla import MMEPolicy
 from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import random_batch, small_policy
-from mme_vla.training.logging import Window
-from mme_vla.types import send
 
 
 def test_images_are_changed_alike_however_an_update_is_divided() -> None:
@@ -37,16 +35,3 @@ def test_weights_for_acting_are_rounded_where_they_may_be(tmp_path: Path, monkey
     monkeypatch.setattr(MMEPolicy, "acts_in_bfloat16", DiffusionPolicy.acts_in_bfloat16)
     unlike = MMEPolicy.from_pretrained(tmp_path, dtype="auto", device="cuda")
     assert {p.dtype for p in unlike.parameters()} == {torch.float32}
-
-
-def test_a_python_number_is_averaged_like_one_on_the_device() -> None:
-    window = Window(batch_size=2)
-    for rate in (1.0, 2.0):
-        window.add({"loss": torch.tensor(rate), "lr": rate})
-    values = window.close(2, lambda tensor, reduction: tensor)
-    assert values["train/lr"] == values["train/loss"] == 1.5
-
-
-def test_sending_to_the_cpu_copies_nothing() -> None:
-    x = torch.ones(2)
-    assert send(x, torch.device("cpu")) is x

@@ -17,7 +17,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.report import html_report
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.subgoals import SubgoalScore, SubgoalTrace, point_distances, subgoal_table, total_score
+from mme_vla.evaluation.rollout.subgoals import SubgoalScore, SubgoalTrace, point_distances, subgoal_tables, total_score
 from mme_vla.evaluation.store import read_records
 from mme_vla.subgoal import BackgroundPredictor, Subgoal, SubgoalPredictor, build_predictor
 from mme_vla.subgoal.text import points_of
@@ -74,11 +74,6 @@ def test_the_oracle_is_always_right(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [], "without a folder nothing is written"
 
 
-def test_a_policy_without_predictor_has_no_score() -> None:
-    (record,) = roll(quick_policy("pi05"), [UNMASK], InlineEnvs())
-    assert "subgoals" not in record.extra and total_score([record]) is None
-
-
 def test_words_are_compared_without_points_case_and_full_stop() -> None:
     assert point_distances("Pick up the cube at <3, 4>.", "pick up  the cube at <0, 0>") == [5.0]
     assert point_distances("press the button", "press the button") == []
@@ -104,7 +99,7 @@ def test_results_tell_right_subgoals_and_distances_by_task() -> None:
 
     protocol = Protocol(("PickXtimes", "VideoUnmask"), 1)
     results = aggregate([record("PickXtimes", 4), record("VideoUnmask", 1, {"empty": 2})], protocol)
-    table = subgoal_table(results.methods[0], results)
+    (table,) = subgoal_tables(results)
     assert table is not None and [row[:5] for row in table.rows] == [
         ["PickXtimes", "1", "4", "100.0", "3.0"],
         ["VideoUnmask", "1", "4", "25.0", "3.0"],
@@ -195,28 +190,6 @@ def test_a_question_that_came_due_while_the_thread_was_busy_is_queried_once_it_i
     settle(predictor)
     assert slow.queries == [[("a", 0), ("b", 0)], [("a", 48)], [("b", 64)]]
     assert predictor.predict([second]) == [Subgoal("b 64", queried=True)] and second.query_step == 64
-    predictor.close()
-
-
-def test_what_waits_for_the_thread_is_queried_in_one_batch() -> None:
-    slow = Slow()
-    predictor = BackgroundPredictor(slow)
-    first, second = predictor.start_episode("A"), predictor.start_episode("B")
-    for episode in (first, second):
-        episode.observe(frames(0, 1))
-    slow.go.release()
-    predictor.predict([first, second])
-    first.observe(frames(1, 16))
-    predictor.predict([first])  # under way
-    for episode in (first, second):
-        episode.observe(frames(17, 16))
-    slow.go.release(2)
-    settle(predictor)
-    third = predictor.start_episode("C")
-    third.observe(frames(0, 1))
-    answers = predictor.predict([first, second, third])
-    assert slow.queries == [[("a", 0), ("b", 0)], [("a", 16)], [("a", 32), ("b", 16), ("c", 0)]]
-    assert [reply.text for reply in answers] == ["a 32", "b 16", "c 0"]
     predictor.close()
 
 

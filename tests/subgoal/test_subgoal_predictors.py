@@ -103,28 +103,6 @@ def test_many_episodes_are_queried_in_one_batch_and_only_those_that_are_due():
     assert predictor.usage.calls == 3 and predictor.usage.input_tokens == 300 and predictor.usage.output_tokens == 21
 
 
-def test_holding_ends_after_its_time():
-    vlm = Scripted("press the first button", "press the second button", *["pick up the container"] * 4)
-    predictor = QwenVL("simple", vlm=vlm)
-    episode = at_start(predictor, task="ButtonUnmaskSwap")
-    query_steps = []
-    for _ in range(20):
-        if predictor.predict([episode])[0].queried:
-            query_steps.append(episode.step)
-        advance(episode)
-    assert query_steps[:3] == [0, 112, 256], "held up to step 100, then up to step 250"
-
-
-def test_the_interval_says_how_frequently_to_ask():
-    predictor = QwenVL("simple", interval=32, vlm=Scripted("a", "b"))
-    episode = at_start(predictor)
-    queries = []
-    for _ in range(4):
-        queries.append(predictor.predict([episode])[0].queried)
-        advance(episode)
-    assert queries == [True, False, True, False]
-
-
 @pytest.mark.parametrize(("answer", "problem"), [("", "empty"), ("pick <|box_start|>(1", "malformed")])
 def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(answer, problem, caplog):
     predictor = QwenVL("grounded", vlm=Scripted(answer, "press", answer))
@@ -197,11 +175,6 @@ def test_replies_do_not_depend_on_what_is_queried_beside(tiny):
     together = tiny.generate(questions, 12)
     assert together == [tiny.generate([question], 12)[0] for question in questions]
     assert all(reply.output_tokens <= 12 for reply in together)
-
-
-def test_marks_of_points_survive_decoding(tiny):
-    ids = tiny.processor.tokenizer("at <|box_start|>(1,2)<|box_end|><|im_end|>", return_tensors="pt").input_ids[0]
-    assert tiny._reply(ids, 5).text == "at <|box_start|>(1,2)<|box_end|>"
 
 
 @pytest.mark.parametrize("name", ["qwenvl", "memer"])
@@ -281,12 +254,6 @@ def test_an_episode_that_is_joined_late_is_queried_at_once():
     episode = predictor.start_episode("goal")
     episode.observe(frames(21))
     assert predictor.predict([episode])[0].queried and episode.query_step == 20
-
-
-def test_a_predictor_knows_the_options_it_was_built_from():
-    section = {"name": "memer", "kind": "simple", "recent": 4, "vlm": Scripted()}
-    assert build_predictor(section).settings == {"kind": "simple", "recent": 4}
-    assert Oracle().settings == {}
 
 
 @pytest.mark.parametrize(

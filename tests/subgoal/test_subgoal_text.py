@@ -82,7 +82,8 @@ def test_histories_grow_as_released(golden):
     for case in golden["qwen_histories"]:
         history = SubgoalHistory()
         for response in case["responses"]:
-            history.add_parsed(parse_subgoal(response))
+            parsed = parse_subgoal(response)
+            history.add(parsed.entry, parsed.points)
         assert history.entries == case["history"]
         assert [list(p) for p in history.points] == case["points"]
         assert numbered(history.entries) == case["history_text"]

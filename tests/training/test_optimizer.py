@@ -22,10 +22,6 @@ def test_learning_rate_follows_the_released_schedule(parity: Path) -> None:
         assert learning_rate(int(step), 5e-5, 10_000) == pytest.approx(rate, rel=2e-6, abs=5e-5 * 1e-7)
 
 
-def test_learning_rate_without_warmup_is_constant() -> None:
-    assert [learning_rate(step, 0.1, 0) for step in (0, 1, 99)] == [0.1, 0.1, 0.1]
-
-
 def test_updates_and_averages_equal_the_released_ones(parity: Path) -> None:
     golden = load_file(parity / "unit_optimizer.safetensors")
     names = [key.removeprefix("out/step0/") for key in golden if key.startswith("out/step0/")]

@@ -1,6 +1,5 @@
 """The training loop, its checkpoints and its refusals, on samples made in memory."""
 
-import io
 import json
 import math
 import os
@@ -13,7 +12,7 @@ from accelerate import Accelerator
 from omegaconf import OmegaConf
 
 from helpers.trainings import RECIPE, SMALL, Samples, collate, loggers, policy, trainer
-from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla import MMEPolicy, UserError
 from mme_vla.config.composition import compose
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
@@ -116,18 +115,6 @@ def test_validation_loss_does_not_depend_on_when_it_is_queried() -> None:
     assert Validation(Samples(built, 5), collate, 3, 3, seed=1).loss(built) == pytest.approx(first, rel=1e-5)
 
 
-def test_without_a_terminal_progress_is_text_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = ProgressLine(6, 0)
-    line.console.file = io.StringIO()
-    with line:
-        trainer(tmp_path, steps=2).run(line, loggers(tmp_path))
-    text = line.console.file.getvalue()
-    assert "step 1/6 · loss" in text
-    assert all(mark in text for mark in ("lr ", "grad ", "samples/s", "GiB"))
-    assert "\x1b" not in text
-    assert "\r" not in text
-
-
 def test_a_folder_that_holds_a_run_is_never_overwritten(tmp_path: Path) -> None:
     train(tmp_path, steps=2)
     with pytest.raises(UserError, match="never overwritten"):
@@ -194,11 +181,6 @@ def test_a_checkpoint_of_another_model_does_not_fit(tmp_path: Path) -> None:
         trainer(tmp_path, built=policy("tokendrop_expert"), run=Run(tmp_path, resolve_checkpoint(tmp_path), 2))
 
 
-def test_a_missing_checkpoint_is_reported_with_its_layout(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="No checkpoint at"):
-        resolve_checkpoint(tmp_path)
-
-
 @pytest.mark.parametrize("files", [["29999/params/_METADATA"], ["29999/params/_METADATA", "history_config.txt"],
                                    ["79999.zip"]])  # fmt: skip
 def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tmp_path: Path, files: list[str]) -> None:
@@ -209,26 +191,6 @@ def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tm
     for place in (run, step):
         with pytest.raises(UserError, match=rf"mme-vla weights {place} \S+_converted"):
             resolve_checkpoint(place)
-
-
-@pytest.mark.parametrize("name", ["tokendrop_expert", "framesamp_modul", "tokendrop_context"])
-def test_a_memory_starts_from_the_memoryless_policy(tmp_path: Path, name: str) -> None:
-    base = policy(seed=5)
-    base.save_pretrained(tmp_path)
-    built = policy(name)
-    sentence = start_from(built, str(tmp_path))
-    assert "memory.encoder" in sentence
-    assert all(torch.equal(built.state_dict()[key], value) for key, value in base.state_dict().items())
-
-
-def test_starting_from_a_smaller_policy_is_refused(tmp_path: Path) -> None:
-    build_policy("pi05", backbone={**SMALL, "depth": 2}).save_pretrained(tmp_path / "deeper")
-    wide = build_policy("pi05", backbone={**SMALL, "action_dim": 16})
-    wide.save_pretrained(tmp_path / "narrow")
-    with pytest.raises(UserError, match="misshapen"):
-        start_from(policy(), str(tmp_path / "narrow"))
-    with pytest.raises(UserError, match="missing"):
-        start_from(build_policy("pi05", backbone={**SMALL, "depth": 3}), str(tmp_path / "deeper"))
 
 
 def test_the_tower_under_a_memory_stays_frozen() -> None:
@@ -307,11 +269,6 @@ def test_missing_logger_package_is_reported(monkeypatch: pytest.MonkeyPatch, nam
     monkeypatch.setitem(__import__("sys").modules, name, None)
     with pytest.raises(UserError, match=f"logger={name} needs the .* `?{name}"):
         check_logger({"logger": {"name": name}})
-
-
-def test_unknown_logger_names_the_nearest(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"Unknown logger 'tensorbord'.*tensorboard"):
-        open_loggers(tmp_path, {"logger": {"name": "tensorbord"}}, 0)
 
 
 def test_loss_change_compares_both_ends() -> None:

@@ -15,9 +15,7 @@ from mme_vla.utils.media import (
     CAPTION,
     RED,
     Tile,
-    VideoWriter,
     contact_sheet,
-    evenly_spaced,
     video_bytes,
     video_frame,
     write_video,
@@ -110,20 +108,9 @@ def test_equal_frames_make_equal_bytes_and_odd_sides_survive(tmp_path: Path) -> 
     assert [frame.shape for frame in decoded(tmp_path / "odd.mp4")] == [(33, 45, 3)] * 4
 
 
-def test_a_video_ends_with_its_block(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "a.mp4", fps=7) as video:
-        video.add(baseline(BLUE))
-    with av.open(str(tmp_path / "a.mp4")) as container:
-        assert container.streams.video[0].average_rate == 7
-
-
 def test_a_contact_sheet_holds_every_tile_and_outlines_the_highlighted_ones() -> None:
     tiles = [Tile(baseline(GREEN), "one"), Tile(baseline(BLUE), "two", RED), Tile(baseline(YELLOW), "three")]
     sheet = np.asarray(contact_sheet(tiles, columns=2, title="all"))
     for tile in tiles:
         assert (sheet == tile.image[0, 0]).all(-1).sum() > 150**2, tile.label
     assert 0 < (sheet == RED).all(-1).sum() < 4 * 2 * 170
-
-
-def test_places_are_distributed_from_the_first_to_the_last() -> None:
-    assert evenly_spaced(9, 3) == [0, 4, 8] and evenly_spaced(2, 5) == [0, 1]

@@ -92,10 +92,7 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"tokenizer": "sample"}, "is none that LeRobot could fetch"),
-        ({"prompt": "state"}, "no step that writes"),
-    ],
+    [({"tokenizer": "sample"}, "is none that LeRobot could fetch"), ({"prompt": "state"}, "no step that writes")],
 )
 def test_what_lerobot_has_no_step_for_is_reported(tmp_path: Path, changes: dict[str, str], message: str) -> None:
     policy = exportable()

@@ -13,7 +13,7 @@ from helpers import golden
 from mme_vla import UserError
 from mme_vla.testing.small import small_policy
 from mme_vla.weights import detect_format, load_weights, open_source, read_stats
-from mme_vla.weights.orbax import find_params, read_orbax, write_orbax
+from mme_vla.weights.orbax import read_orbax, write_orbax
 
 pytest.importorskip("tensorstore", reason="reading Orbax checkpoints needs the extra 'orbax'")
 
@@ -65,14 +65,6 @@ def test_run_step_and_arrays_are_the_same_source(place: Path) -> None:
     assert stats.actions.q99[1] == 1.5
 
 
-def test_the_newest_step_of_a_run_is_taken(tmp_path: Path) -> None:
-    for step in (9, 10):
-        write_orbax({"step": torch.tensor(float(step))}, tmp_path / str(step) / "params")
-    params = find_params(tmp_path)
-    assert params is not None
-    assert read_orbax(params)["step"] == 10
-
-
 @torch.no_grad()
 def test_a_checkpoint_of_orbax_reproduces_the_golden_outputs(parity: Path) -> None:
     tensors, about = golden.load(parity, CASE)
@@ -110,9 +102,3 @@ def test_all_leaves_that_do_not_fit_are_listed_together(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"(?s)orbax_plain.*missing.*unexpected:\s+scale.*2 misshapen"):
         load_weights(policy, PLAIN)
     assert all(torch.equal(tensor, before[name]) for name, tensor in policy.state_dict().items())
-
-
-def test_without_tensorstore_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "tensorstore", None)
-    with pytest.raises(UserError, match="--extra orbax"):
-        read_orbax(PLAIN)

@@ -1,7 +1,6 @@
 """The front door: loading, starting another variant, converting, and the statistics beside foreign weights."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from helpers import commands
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
@@ -49,13 +47,6 @@ def test_every_format_is_reported_and_fills_a_policy_on_meta(fmt: str, bases: di
     loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
     assert equal(loaded, base)
     assert all(p.requires_grad for p in loaded.parameters())
-
-
-@pytest.mark.parametrize("fmt", ["ours", "openpi", "released"])
-def test_statistics_of_one_dataset_come_with_the_weights(fmt: str, bases: dict[str, Path]) -> None:
-    policy = build_policy("pi05")
-    load_weights(policy, bases[fmt])
-    assert policy.require_processor().stats is not None
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
@@ -153,24 +144,6 @@ def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
         convert(tmp_path / "released", tmp_path / "x", ["model=framesamp_expert", "backbone=tiny"])
     with pytest.raises(UserError, match="brings its own configuration"):
         convert(tmp_path / "ours", tmp_path / "x", ["model=framesamp_expert"])
-
-
-@pytest.mark.slow
-def test_the_command_prints_the_mapping_and_saves_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
-    command = ["mme_vla", "weights", str(bases["lerobot"]), str(tmp_path / "new")]
-    done = commands.run(*command, "backbone=tiny", "--dry-run")
-    assert done.returncode == 0, done.stderr
-    assert re.search(
-        r"q_proj\.weight +\S+ +backbone\.transformer\.layers\.\*\.experts\.action\.qkv\.weight", done.stdout
-    )
-    assert "unread" in done.stdout
-    assert re.search(r"tied.*\n.*\n.*lm_head\.weight +\S+embed_tokens\.weight", done.stdout)
-    assert "derived: recomputed constants: none" in done.stdout
-    assert list(tmp_path.iterdir()) == []
-    wrong = commands.run(*command, "backbone=tinny")
-    assert wrong.returncode == 2
-    assert "tiny" in wrong.stderr
-    assert "Traceback" not in wrong.stderr
 
 
 def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.errors import listed
 from mme_vla.utils import read_json
 
 
@@ -81,9 +82,5 @@ def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:
     for name, task in coverage.items():
         covered, episodes = task.goals - len(task.missing), task.episodes - task.missing_episodes
         lines.append(f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes} episodes")
-        lines += [f"  never shown: {goal} (episode {_few(numbers)})" for goal, numbers in task.missing.items()]
+        lines += [f"  never shown: {goal} (episode {listed(numbers, 5)})" for goal, numbers in task.missing.items()]
     return "\n".join(lines)
-
-
-def _few(numbers: Sequence[int], most: int = 5) -> str:
-    return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")

@@ -10,7 +10,7 @@ from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_m
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
 from mme_vla.envs.observations import RenderRequest
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.memory.base import past_view_spec
 from mme_vla.registry import MEMORIES
 
@@ -42,8 +42,8 @@ class FrameChoice:
     every: int = 1
 
     def __post_init__(self) -> None:
-        if isinstance(self.at, bool) or (isinstance(self.at, int) and self.at < 1):
-            raise UserError(f"frames={self.at!r} is not understood; write all, {GRAMMAR}.")
+        is_choice = not isinstance(self.at, bool) and (not isinstance(self.at, int) or self.at >= 1)
+        require(is_choice, f"frames={self.at!r} is not understood; write all, {GRAMMAR}.")
         if self.at not in (DECISIONS, CHOICES) and not isinstance(self.at, int):
             spans(self.at, "frames", f"all, {GRAMMAR}")
         if self.memory is not None:

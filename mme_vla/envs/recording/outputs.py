@@ -12,7 +12,7 @@ import numpy as np
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.utils import read_json, remove_drafts, write_atomically
 
 if TYPE_CHECKING:
@@ -155,11 +155,12 @@ class RecordingPlan:
         for place in self.places:
             if not place.exists():
                 missing.append(place)
-            elif not (self._is_dataset(options) if place == self.dataset else self._is_official(place)):
-                raise UserError(
-                    f"{place} exists already, and is not what this command records; choose another place, or remove it "
-                    "yourself."
-                )
+                continue
+            require(
+                self._is_dataset(options) if place == self.dataset else self._is_official(place),
+                f"{place} exists already, and is not what this command records; choose another place, or remove it "
+                "yourself.",
+            )
         return missing
 
     def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:

@@ -54,8 +54,7 @@ def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["Sub
 
 def _ended(env: "Task") -> bool:
     """Evaluate once; whether the episode is over."""
-    env.evaluate()
-    env.progress.planned = env.progress.index
+    env.evaluate_planned()
     return env.progress.succeeded or env.progress.failed
 
 

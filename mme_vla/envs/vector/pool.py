@@ -26,7 +26,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.utils.processes import signals_deferred
 
 
@@ -119,10 +119,8 @@ class VecEnv:
         options: dict[str, Any] | None = None,
         timeout: float = 600.0,
     ) -> None:
-        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
-            raise UserError(f"workers is {workers!r}; expected a positive integer.")
-        if not timeout > 0:
-            raise UserError(f"timeout is {timeout!r}; expected a positive number of seconds.")
+        require(type(workers) is int and workers >= 1, f"workers is {workers!r}; expected a positive integer.")
+        require(timeout > 0, f"timeout is {timeout!r}; expected a positive number of seconds.")
         self.jobs = deque(jobs)
         """Episodes that no worker has begun yet."""
         self.timeout = timeout
@@ -173,8 +171,7 @@ class VecEnv:
     def send(self, worker: int, action: Any) -> None:
         """Let a worker perform an action; returns at once."""
         state = self._idle(worker)
-        if state.job is None:
-            raise UserError(f"Worker {worker} runs no episode; call start() or start_next() first.")
+        require(state.job is not None, f"Worker {worker} runs no episode; call start() or start_next() first.")
         state.resetting = False
         self._command(worker, protocol.STEP, action)
 
@@ -237,11 +234,11 @@ class VecEnv:
 
     def _idle(self, worker: int) -> _Worker:
         self._require_open()
-        if not 0 <= worker < len(self._workers):
-            raise UserError(f"Unknown worker {worker}; expected 0 to {len(self._workers) - 1}.")
+        last = len(self._workers) - 1
+        require(0 <= worker <= last, f"Unknown worker {worker}; expected 0 to {last}.")
         state = self._workers[worker]
-        if state.running or any(reply.worker == worker for reply in self._lost):
-            raise UserError(f"Worker {worker} is still at its last command; call recv() first.")
+        is_idle = not state.running and all(reply.worker != worker for reply in self._lost)
+        require(is_idle, f"Worker {worker} is still at its last command; call recv() first.")
         return state
 
     def _command(self, worker: int, *message: Any) -> None:
@@ -296,8 +293,7 @@ class VecEnv:
         wait([state.connection for state in running], timeout=max(0.0, min(until - time.monotonic(), 60.0)))
 
     def _require_open(self) -> None:
-        if self._closed:
-            raise UserError("The environments are closed; make new ones.")
+        require(not self._closed, "The environments are closed; make new ones.")
 
 
 def _work(plugins: Sequence[str], *arguments: Any) -> None:
@@ -327,13 +323,9 @@ def make_vec_env(
         timeout: seconds after which a command without result counts as hung.
         factory: what makes an environment, importable by name.
         options: further arguments of `make_env`, such as `max_steps`, `render` and `include_…`.
-
-    Raises:
-        UserError: an unknown task, split, episode or action space, or a missing package.
     """
     names = [tasks] if isinstance(tasks, str) else list(tasks)
-    if not names:
-        raise UserError("No task given; expected a task name or several.")
+    require(names, "No task given; expected a task name or several.")
     numbers = None if episodes is None else list(episodes)
     jobs = []
     for name in names:

@@ -27,8 +27,7 @@ from mme_vla.policy.capabilities import CountsCost
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
     """Count a model at a memory budget (None: its own).
 
-    Args:
-        backbone: a file of `configs/backbone`; by default the one that is the model's full size.
+    backbone: a file of `configs/backbone`; by default the one that is the model's full size.
     """
     _check_attention_is_counted()
     policy = on_meta(model, budget, backbone)

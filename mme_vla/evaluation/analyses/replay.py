@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from PIL import Image
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.memory.base import Memory, make_scorer
 from mme_vla.memory.history import OnlineHistory
@@ -19,8 +20,13 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.prompt import SubgoalText
 
-STRIDE = 16
-"""Steps between two chunks, as an evaluation executes them."""
+STRIDE = 16  # Steps between two chunks, as an evaluation executes them
+
+
+def check_episode(source: EpisodeSource, episode: Any) -> None:
+    """Refuse an episode that a dataset does not have."""
+    if not isinstance(episode, int) or not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
 
 
 def replay(
@@ -31,14 +37,12 @@ def replay(
     The recorded actions are executed, not the policy's. Subgoals, where the policy reads them,
     are the recorded ones.
 
-    Args:
-        most: chunks at most, spread over the episode.
+    most: chunks at most, spread over the episode.
 
     Yields:
         The step a chunk was just chosen at, and the running episode.
     """
-    if not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    check_episode(source, episode)
     give_statistics(policy, source)
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     steps = np.arange(start, length, stride)
@@ -58,8 +62,7 @@ def replay(
         n_observed = step + 1
         if text is not None:
             texts = source.subgoals(episode, step)
-            if text.kind not in texts:
-                raise UserError(f"{source.name} has no {text.kind}, which this policy reads.")
+            require(text.kind in texts, f"{source.name} has no {text.kind}, which this policy reads.")
             running.subgoal = texts[text.kind]
         policy.act([running])
         yield step, running
@@ -75,8 +78,7 @@ def replay_all(
 ) -> int:
     """Replay several episodes (None: all); return how many chunks were chosen.
 
-    Args:
-        after: called after every chunk, with its episode and step.
+    after: called after every chunk, with its episode and step.
     """
     count = 0
     for episode in range(len(source)) if episodes is None else episodes:
@@ -174,12 +176,8 @@ def selection_sheets(
     Yields:
         (step, image); images grow with what is remembered.
     """
-    import torch
-
-    if not 0 <= episode < len(source):
-        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
-    if every < 1:
-        raise UserError(f"every={every} must be at least 1: the steps between two images.")
+    check_episode(source, episode)
+    require(every >= 1, f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
     history, patches = OnlineHistory(memory.storage, make_scorer(memory), start), memory.storage.grid**2

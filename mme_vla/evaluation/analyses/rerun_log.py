@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import missing_extra, require
 
 _JPEG_QUALITY = 90
 
@@ -25,8 +25,7 @@ class RerunLog:
             import rerun
         except ImportError:
             raise missing_extra("Rerun output", "viz") from None
-        if path.suffix != ".rrd":
-            raise UserError(f"--rerun {path}: the viewer reads files that end in .rrd.")
+        require(path.suffix == ".rrd", f"--rerun {path}: the viewer reads files that end in .rrd.")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._rerun: Any = rerun
         self._stream: Any = rerun.RecordingStream("mme_vla")

@@ -8,9 +8,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import layout_mask
 from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, StaticKV
-from mme_vla.errors import UserError
+from mme_vla.backbone.layers import layout_mask
+from mme_vla.errors import UserError, require
 from mme_vla.integration.modulator import Modulator
 from mme_vla.policy.mme import MMEPolicy
 
@@ -31,8 +31,6 @@ class AttentionMass:
 
     def share(self, part: str) -> Tensor:
         """Mass by layer [depth] outside the actions themselves, so that it adds up to 100 % as in the paper's table."""
-        if part not in self.parts:
-            raise UserError(f"No attention on {part!r}: the sequence holds {', '.join(self.parts)}.")
         self_mass = self.layers[:, self.parts.index("action")]
         return self.layers[:, self.parts.index(part)] / (1 - self_mass)
 
@@ -63,12 +61,16 @@ class Watch[T]:
 
     def result(self) -> T:
         """What was observed."""
-        return self._read(self._sums)
+        return self._checked(self._sums)
 
     def lap(self) -> T:
         """What was observed since the last lap."""
         since, self._lap = self._sums - self._lap, self._sums.clone()
-        return self._read(since)
+        return self._checked(since)
+
+    def _checked(self, sums: Tensor) -> T:
+        require(sums.any(), f"{type(self).__name__} has seen nothing: let the policy act inside the `with` block.")
+        return self._read(sums)
 
     def _hooks(self) -> list[Any]:
         raise NotImplementedError
@@ -100,8 +102,6 @@ class AttentionWatch(Watch[AttentionMass]):
         return [transformer.register_forward_pre_hook(self._begin, with_kwargs=True), *layers]
 
     def _read(self, sums: Tensor) -> AttentionMass:
-        if not sums.any():
-            raise UserError("No action token has been seen: let the policy act inside the `with` block.")
         parts = list(dict.fromkeys(PARTS.get(name, name) for name in self._names))
         layers = torch.zeros(len(sums), len(parts), dtype=torch.float64)
         for column, name in enumerate(self._names):
@@ -115,8 +115,6 @@ class AttentionWatch(Watch[AttentionMass]):
         if not self._watching:
             return
         names = [span.name for span in layout.spans]
-        if self._names and self._names != names:
-            raise UserError(f"One watch sees one kind of policy: the sequence was {self._names}, now it is {names}.")
         self._names, self._lengths = names, [span.length for span in layout.spans]
         if not self._sums.ndim:
             self._sums = torch.zeros(len(transformer.layers), len(names), dtype=torch.float64)
@@ -173,8 +171,7 @@ class ModulationWatch(Watch[ModulationStats]):
         integration = self.policy.integration
         if not isinstance(integration, Modulator):
             raise UserError(
-                "This policy has no modulator, so no scale and bias to observe: choose one with integration=modulator, "
-                "such as framesamp_modul."
+                "This policy has no modulator to observe: choose integration=modulator, or framesamp_modul."
             )
         if not self._sums.ndim:
             self._sums = torch.zeros(len(integration.layers), 2, 3, dtype=torch.float64)
@@ -182,8 +179,6 @@ class ModulationWatch(Watch[ModulationStats]):
         return [linear.register_forward_hook(partial(self._take, i)) for i, linear in enumerate(linears)]
 
     def _read(self, sums: Tensor) -> ModulationStats:
-        if not sums.any():
-            raise UserError("No modulation has been seen: let the policy act inside the `with` block.")
         mean, std = _moments(sums)  # depth × (scale, bias) × (count, sum, squares)
         means, stds = _moments(sums.sum(0))
         overall = {name: (float(means[i]), float(stds[i])) for i, name in enumerate(("scale", "bias"))}

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mme_vla.envs.metadata import FURTHER_SPLITS
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
@@ -29,8 +29,7 @@ from mme_vla.evaluation.results.scopes import (
     tasks_of,
 )
 
-Outcomes = np.ndarray
-"""Successes [episodes, runs]: every run on the same episodes."""
+Outcomes = np.ndarray  # Successes [episodes, runs]: every run on the same episodes
 
 
 class Interval(NamedTuple):
@@ -42,8 +41,6 @@ class Interval(NamedTuple):
 
 def mean_std(values: Sequence[float]) -> tuple[float, float | None]:
     """Mean and sample standard deviation (divisor n − 1), as the released aggregation; one value has none."""
-    if not values:
-        raise ValueError("mean_std() needs at least one value.")
     array = np.asarray(values, np.float64)
     return float(array.mean()), float(array.std(ddof=1)) if len(array) > 1 else None
 
@@ -81,9 +78,8 @@ def bootstrap(
 ) -> Interval:
     """Percentile interval of a mean over tasks, drawing episodes anew within each task.
 
-    Args:
-        tasks: for each task a number per episode [episodes], already averaged over the runs: an episode is sampled with
-            all of them.
+    tasks: for each task a number per episode [episodes], already averaged over the runs: an episode is sampled with all
+    of them.
     """
     rng = np.random.default_rng(seed)
     means = np.zeros(samples)
@@ -219,10 +215,8 @@ def aggregate(
 ) -> Results:
     """Make all figures.
 
-    Args:
-        records: of any number of runs; they are merged here. protocol: its tasks are `tasks_of(records)` by default.
-        split: only these; needed if there are several.
-        conflicts: see `merge`.
+    records: of any number of runs; they are merged here. protocol: its tasks are `tasks_of(records)` by default. split:
+    only these; needed if there are several. conflicts: see `merge`.
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))
@@ -235,14 +229,13 @@ def aggregate(
     if split is None and len(splits) > 1:
         raise UserError(f"These are results of several splits ({', '.join(splits)}): choose one with --split.")
     selected = [r for r in merged if split in (None, r.split)]
-    if not selected:
-        raise UserError(f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}.")
+    require(selected, f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}.")
     inside = [r for r in selected if protocol.expects(r.key)]
     counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
-    if not counted:
-        raise UserError(
-            f"None of the {len(selected)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
-        )
+    require(
+        counted,
+        f"None of the {len(selected)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1}).",
+    )
     _check_environments(counted)
     groups: dict[tuple[str, str | None, int | None, str | None], list[Run]] = {}
     for key, members in by_run(counted).items():
@@ -372,11 +365,11 @@ def _check_environments(records: Sequence[EpisodeRecord]) -> None:
     seeds: dict[EpisodeKey, EpisodeRecord] = {}
     for record in records:
         first = seeds.setdefault(record.key, record)
-        if (first.seed, first.difficulty) != (record.seed, record.difficulty):
-            raise UserError(
-                f"{record.task} {record.episode} has seed {first.seed} ({first.difficulty}) in {first.run}, "
-                f"but {record.seed} ({record.difficulty}) in {record.run}: these are different benchmarks."
-            )
+        require(
+            (first.seed, first.difficulty) == (record.seed, record.difficulty),
+            f"{record.task} {record.episode} has seed {first.seed} ({first.difficulty}) in {first.run}, "
+            f"but {record.seed} ({record.difficulty}) in {record.run}: these are different benchmarks.",
+        )
 
 
 def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[str]:

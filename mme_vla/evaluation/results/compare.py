@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.results.aggregate import Interval, Method, bootstrap, holm, sign_test
 from mme_vla.evaluation.results.scopes import Protocol, scopes
@@ -78,12 +78,10 @@ def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
 
 def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     """Compare two methods."""
-    if first is second:
-        raise UserError(f"{first.label} cannot be compared with itself; name two methods.")
+    require(first is not second, f"{first.label} cannot be compared with itself; name two methods.")
     rates = [_rates(method) for method in (first, second)]
     common = [key for key in rates[0] if key in rates[1]]
-    if not common:
-        raise UserError(f"{first.label} and {second.label} have no episode in common: there is nothing to pair.")
+    require(common, f"{first.label} and {second.label} have no episode in common: there is nothing to pair.")
     shared = [task for task in protocol.tasks if any(key.task == task for key in common)]
     tasks = [task for task in shared if task in protocol.averaged] or shared
     common = [key for key in common if key.task in tasks]

@@ -8,11 +8,11 @@ import numpy as np
 
 from mme_vla.envs.metadata import BASE, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeRecord, merge
-from mme_vla.evaluation.results.aggregate import Interval, Method, Results, wilson
+from mme_vla.evaluation.results.aggregate import Interval, Results, wilson
 from mme_vla.evaluation.results.plots import COLOURS, figure, svg
-from mme_vla.evaluation.results.tables import Table
+from mme_vla.evaluation.results.tables import Table, task_table
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,7 @@ class Point:
         return 100 * self.won / self.episodes
 
 
-Curves = dict[tuple[str, str, str], list[Point]]
-"""(model, task, dial) → points, ascending."""
+Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → points, ascending
 
 
 def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
@@ -46,8 +45,7 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
         if variant is not None and variant.dial:
             at = (str(record.run._replace(split=BASE)), record.task, variant.dial)
             groups.setdefault(at, {}).setdefault(variant.turned, []).append(record)
-    if not groups:
-        raise UserError("None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
+    require(groups, "None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
     curves: Curves = {}
     for (run, task, dial), places in groups.items():
         baseline = [r for r in merged if r.split == BASE and r.task == task and str(r.run) == run]
@@ -98,8 +96,7 @@ def stress_figures(curves: Curves) -> dict[str, str]:
     return figures
 
 
-EXTRA = "process"
-"""Where a record keeps it."""
+EXTRA = "process"  # Where a record keeps it
 CAPTION = (
     "Progress: sub-tasks done, of those there are. Then how many episodes ended by a wrong choice that is a mistake of "
     "memory (which one, where, how many, in what order, how), by another wrong one, or with the time run out."
@@ -113,20 +110,14 @@ def process_of(record: EpisodeRecord) -> ProcessScore | None:
 
 
 def process_tables(results: Results) -> list[Table]:
-    """A table of every method that has scores."""
-    return [table for method in results.methods if (table := process_table(method, results))]
-
-
-def process_table(method: Method, results: Results) -> Table | None:
-    """Where the chains of one method broke, over all its runs; None without scores."""
-    records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
-    if not records:
-        return None
-    by_task = {task: [r for r in records if r.task == task] for task in results.protocol.tasks}
-    rows = [_row(task, members) for task, members in by_task.items() if members]
-    rows.append(_row("all", records))
+    """Where the chains broke, a table of every method that has scores, over all its runs."""
     columns = ["", "episodes", "progress (%)", "success", *OPERATIONS, MOTION, "stuck"]
-    return Table(f"{method.label}: where the chain broke", columns, rows, {len(rows) - 1}, {len(rows) - 1})
+    tables = []
+    for method in results.methods:
+        records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
+        title = f"{method.label}: where the chain broke"
+        tables += task_table(title, columns, records, results.protocol.tasks, _row)
+    return tables
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:

@@ -20,8 +20,7 @@ FAMILIES = {"none": "#7a8b99", "symbolic": "#b8972f", "perceptual": "#1f6f8b", "
             "prior": "#b5523b"}  # fmt: skip
 INK, FAINT = "#2b2d42", "#8d99ae"
 MOST_BARS = 8
-SWEPT = ("framesamp_modul", "tokendrop_modul")
-"""Models whose memory budget the paper varies."""
+SWEPT = ("framesamp_modul", "tokendrop_modul")  # Models whose memory budget the paper varies
 _STYLE = {
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 10, "axes.edgecolor": FAINT,
     "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK, "axes.spines.top": False,
@@ -103,8 +102,7 @@ def heat_map(results: Results) -> str:
 def efficiency(results: Results, flops: dict[str, float]) -> str:
     """Success over what a chunk costs: one's own models filled, the paper's numbers as rings.
 
-    Args:
-        flops: of a sampled chunk at full size, by model.
+    flops: of a sampled chunk at full size, by model.
     """
     with figure((5.6, 3.9)) as (canvas, (axes,)):
         named = set()
@@ -135,8 +133,7 @@ _FAMILY_NAMES = {"none": "no memory", "symbolic": "symbolic", "perceptual": "per
 def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) -> str:
     """Success over the memory budget: the paper's sweep dashed, one's own models with their intervals.
 
-    Args:
-        points: as `budget_points` gives them.
+    points: as `budget_points` gives them.
     """
     order = list(dict.fromkeys(method.model for method in results.methods))
     with figure((5.6, 3.9)) as (canvas, (axes,)):

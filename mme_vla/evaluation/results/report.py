@@ -42,11 +42,7 @@ def html_page(title: str, sections: Sequence[Section], subtitle: str = "", notes
 
 
 def html_report(results: Results, comparisons: Sequence[Comparison], title: str) -> str:
-    """The page.
-
-    Args:
-        results: of any number of methods. comparisons: shown if there are any. title: of the page.
-    """
+    """The page. results: of any number of methods. comparisons: shown if there are any. title: of the page."""
     protocol = results.protocol
     methods, runs = len(results.methods), sum(len(method.runs) for method in results.methods)
     sub = f"{methods} method{'s' * (methods > 1)}, {runs} run{'s' * (runs > 1)} of "

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 
 DIFFICULTIES = ("easy", "medium", "hard")
@@ -17,14 +17,10 @@ GROUPS = (
     "Dynamic Online Scene-Change",
     "Event-Salient",
 )
-OWN = "Own tasks"
-"""Suite and group of the tasks that are not RoboMME's: a user's own."""
-TEST_EPISODES = 50
-"""Episodes a task has in the test split; the paper runs all of them."""
-MAX_STEPS = 1300
-"""Steps an episode may take in the paper's experiments."""
-PAPER_SEEDS = (7, 42, 0)
-"""Model seeds, in the order of the leaderboard's columns."""
+OWN = "Own tasks"  # Suite and group of the tasks that are not RoboMME's: a user's own
+TEST_EPISODES = 50  # Episodes a task has in the test split; the paper runs all of them
+MAX_STEPS = 1300  # Steps an episode may take in the paper's experiments
+PAPER_SEEDS = (7, 42, 0)  # Model seeds, in the order of the leaderboard's columns
 
 
 class Task(NamedTuple):
@@ -66,8 +62,7 @@ _TASKS = (
     _task("RouteStick", 3, "P", 0, True, 370),
 )
 TASK_FACTS: dict[str, Task] = {task.name: task for task in _TASKS}
-TASK_NAMES = tuple(TASK_FACTS)
-"""The tasks in the benchmark's order."""
+TASK_NAMES = tuple(TASK_FACTS)  # The tasks in the benchmark's order
 PAPER_ORDER = (
     "BinFill", "PickXtimes", "SwingXtimes", "StopCube",
     "VideoUnmask", "ButtonUnmask", "VideoUnmaskSwap", "ButtonUnmaskSwap",
@@ -100,14 +95,14 @@ class Protocol:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.tasks or len(set(self.tasks)) < len(self.tasks):
-            raise UserError(f"tasks={list(self.tasks)} must name at least one task, each once.")
-        if self.episodes < 1:
-            raise UserError(f"episodes={self.episodes} must be at least 1: how many a task has.")
-        if self.errors not in ("failure", "missing"):
-            raise UserError(f"errors={self.errors!r} must be failure or missing.")
-        if not 0 < self.confidence < 1:
-            raise UserError(f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95.")
+        for holds, message in (
+            (self.tasks and len(set(self.tasks)) == len(self.tasks),
+             f"tasks={list(self.tasks)} must name at least one task, each once."),
+            (self.episodes >= 1, f"episodes={self.episodes} must be at least 1: how many a task has."),
+            (self.errors in ("failure", "missing"), f"errors={self.errors!r} must be failure or missing."),
+            (0 < self.confidence < 1, f"confidence={self.confidence} must lie between 0 and 1, for instance 0.95."),
+        ):  # fmt: skip
+            require(holds, message)
 
     def expects(self, key: EpisodeKey) -> bool:
         return key.task in self.tasks and 0 <= key.episode < self.episodes

@@ -2,11 +2,12 @@
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from mme_vla.errors import printable
+from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import PAPER_SEEDS
@@ -25,6 +26,19 @@ class Table:
     rows: list[list[str]]
     rules: set[int] = field(default_factory=set)
     strong: set[int] = field(default_factory=set)
+
+
+def task_table(
+    title: str,
+    columns: Sequence[str],
+    records: Sequence[EpisodeRecord],
+    tasks: Sequence[str],
+    row: Callable[[str, Sequence[EpisodeRecord]], list[str]],
+) -> list[Table]:
+    """One table with a row for each task that has records, and one for all of them; none without records."""
+    by_task = {task: [record for record in records if record.task == task] for task in tasks}
+    rows = [row(task, members) for task, members in by_task.items() if members]
+    return [Table(title, columns, [*rows, row("all", records)], {len(rows)}, {len(rows)})] if records else []
 
 
 def show(figure: Figure, short: bool = False) -> str:
@@ -65,17 +79,8 @@ def overview(results: Results) -> Table:
             f"{average.done:,}" if average.done == average.expected else f"{average.done:,} of {average.expected:,}"
         )
         cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
-        rows.append(
-            [
-                method.label,
-                str(average.runs),
-                episodes,
-                *cells,
-                show(average, short=True),
-                span(average),
-                show_paper(average),
-            ]
-        )
+        figures = [show(average, short=True), span(average), show_paper(average)]
+        rows.append([method.label, str(average.runs), episodes, *cells, *figures])
     return Table("Success rate (%), mean ± sample standard deviation over runs", columns, rows)
 
 
@@ -112,16 +117,9 @@ def runs_table(results: Results) -> Table:
         for run in method.runs:
             outcomes = run.outcomes
             rate = f"{100 * outcomes['success'] / run.expected:.2f}" if run.complete else "incomplete"
-            rows.append(
-                [
-                    method.label,
-                    str(run.key.checkpoint),
-                    str(run.key.model_seed),
-                    f"{len(run.averaged)} of {run.expected}",
-                ]
-                + [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
-                + [rate]
-            )
+            done = f"{len(run.averaged)} of {run.expected}"
+            counts = [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
+            rows.append([method.label, str(run.key.checkpoint), str(run.key.model_seed), done, *counts, rate])
     columns = ["method", "checkpoint", "seed", "episodes", "success", "fail", "timeout", "error", "average (%)"]
     return Table("Runs", columns, rows)
 

@@ -19,7 +19,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.subtasks import Progress, process_score
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
@@ -100,8 +100,7 @@ class ChunkEnv:
     def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, dict[str, Any]]:
         """All frames of the conditioning video, the current one last, and the report.
 
-        Args:
-            draw: the requested images; by default all.
+        draw: the requested images; by default all.
         """
         self._ask(draw)
         with self._simulation():
@@ -116,9 +115,8 @@ class ChunkEnv:
     def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute actions one after the other until they, or the episode, are over.
 
-        Args:
-            command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that
-                are requested, where it is not all: frames are counted from the reset on, and the newest is the last.
+        command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that are
+        requested, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
             The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
@@ -168,10 +166,7 @@ class ChunkEnv:
     def _note_pose(self, observation: dict[str, list[Any]]) -> None:
         if not self._robot.action.of_pose:
             return
-        if "eef_state_list" not in observation:
-            available = ", ".join(sorted(observation))
-            raise UserError(f"The policy's actions are differences to 'eef_state', which this environment does not "
-                            f"deliver: only {available}.")  # fmt: skip
+        _require(observation, "eef_state", f"The policy's actions are differences to 'eef_state', {MISSING}")
         if poses := observation["eef_state_list"]:
             self._pose = np.asarray(poses[-1], np.float64)
 
@@ -219,6 +214,13 @@ def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
+MISSING = "which this environment does not deliver"
+
+
+def _require(observation: dict[str, list[Any]], name: str, message: str) -> None:
+    require(f"{name}_list" in observation, f"{message}; there are only {', '.join(sorted(observation))}.")
+
+
 class _Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
@@ -234,15 +236,11 @@ class _Frames:
         self._states += [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
         blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
         for name, images in self._images.items():
-            if not blind and name in self._cameras and f"{name}_rgb_list" not in observation:
-                raise UserError(f"The environment has no camera {name!r}; it shows {', '.join(sorted(observation))}.")
+            if not blind and name in self._cameras:
+                _require(observation, f"{name}_rgb", f"The environment has no camera {name!r}")
             images += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         for name, readings in self._readings.items():
-            if f"{name}_list" not in observation:
-                available = ", ".join(sorted(observation))
-                raise UserError(
-                    f"The policy reads {name!r}, which this environment does not deliver: only {available}."
-                )
+            _require(observation, name, f"The policy reads {name!r}, {MISSING}")
             readings += observation[f"{name}_list"]
         return len(joints)
 
@@ -280,10 +278,8 @@ def make_rollout_env(
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
-    Args:
-        base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
-        videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
-        robot, most_actions: the policy's.
+    base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`. videos: folder, and
+    which outcomes are kept: `all`, `success` or `failure`. robot, most_actions: the policy's.
     """
     video = None
     if videos is not None:

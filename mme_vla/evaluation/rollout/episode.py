@@ -30,8 +30,7 @@ class RunningEpisode:
     Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of a conditioning
     video do not keep other episodes waiting.
 
-    Args:
-        subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
+    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
     """
 
     def __init__(
@@ -46,8 +45,7 @@ class RunningEpisode:
         self._policy, self._subgoals, self._piece = policy, subgoals, piece
         self.job, self.trace = job, trace
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
-        self.watched: Any = None
-        """What the subgoal predictor knows of the episode."""
+        self.watched: Any = None  # What the subgoal predictor knows of the episode
         self.worker = -1
         self.steps = self.chunks = 0
         self.video_frames = 0

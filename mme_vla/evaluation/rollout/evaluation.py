@@ -11,7 +11,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
@@ -21,6 +21,7 @@ from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
+from mme_vla.policy.saving import composition_digest
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
@@ -48,8 +49,7 @@ def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, sp
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
     """Read `0/4` (the first of four), or the rank of this process under torchrun.
 
-    Args:
-        text: wins over the environment. environment: by default the process's own.
+    text: wins over the environment. environment: by default the process's own.
     """
     environment = os.environ if environment is None else environment
     if text is None:
@@ -58,8 +58,7 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
         text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
-    if shard.index >= shard.count:
-        raise UserError(f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
+    require(shard.index < shard.count, f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
     return shard
 
 
@@ -112,9 +111,6 @@ def evaluate(
         notes: kept in `run.json` and never compared.
         times_from: earlier records, of any policy: the longest episodes begin first, and say how long all will take;
             by default those in `output` and in the folders beside it.
-
-    Raises:
-        UserError: `output` holds another run, or the environments cannot be built.
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
@@ -138,7 +134,12 @@ def evaluate(
                 progress.say(str(forecast))
             waiting = Waiting(missing, Claims(output, shard.file) if shard.count > 1 else None)
             envs = _environments(policy, output, settings, base, workers) if missing else None
-            workload = _run(policy, waiting, envs, output, facts, settings, subgoals, log, progress)
+            workload = Workload()
+            if envs is not None:
+                folder = output / SUBGOALS if settings.subgoal_log else None
+                with envs:
+                    rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress, workload)
+                    rollout.run(waiting)
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
@@ -159,26 +160,6 @@ def _environments(
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
     return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)
-
-
-def _run(
-    policy: Policy,
-    waiting: Waiting,
-    environments: VecEnv | None,
-    output: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    subgoals: SubgoalPredictor | None,
-    log: RecordLog,
-    progress: RolloutProgress,
-) -> Workload:
-    if environments is None:
-        return Workload()
-    with environments as envs:
-        folder = output / SUBGOALS if settings.subgoal_log else None
-        rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress)
-        rollout.run(waiting)
-    return rollout.workload
 
 
 def run_settings(
@@ -239,6 +220,19 @@ def checkpoint_label(source: str | None) -> int | str:
     name = Path(source).name
     step = re.search(r"(?:^|[_-])(\d+)$", name)
     return int(step[1]) if step else name
+
+
+def facts_of(
+    policy: Policy, name: str | None, source: str | None, settings: RolloutSettings, subgoal: str | None
+) -> RunFacts:
+    """What the records of a run have in common.
+
+    name: of the model; None for the policy's own. source: the checkpoint. subgoal: name of the predictor.
+    """
+    return RunFacts(
+        name or str(policy.config.get("name", "policy")), checkpoint_label(source), settings.seed, settings.split,
+        settings.max_steps, subgoal, memory_budget(policy), composition_digest(policy.config),
+    )  # fmt: skip
 
 
 def memory_budget(policy: Policy) -> int | None:

@@ -20,8 +20,7 @@ from mme_vla.evaluation.store import find_records, read_records
 class RolloutProgress:
     """A bar on a terminal; anywhere else the lines alone. A context manager.
 
-    Args:
-        total: episodes of this process. before: records of those that an earlier run has finished.
+    total: episodes of this process. before: records of those that an earlier run has finished.
     """
 
     def __init__(self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True) -> None:
@@ -130,8 +129,7 @@ class Durations:
         Environments run side by side while the policy acts: the slower of the two decides, and the
         longest episode is waited for in any case.
 
-        Args:
-            workers: environments at a time in a process. processes: that share the run.
+        workers: environments at a time in a process. processes: that share the run.
         """
         if not self.records or not jobs:
             return None

@@ -18,16 +18,14 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
-EVERY = range(2**31)
-"""Whatever frames there are."""
+EVERY = range(2**31)  # Whatever frames there are
 LONGEST_VIDEO = 10_000  # frames
 
 
 class RenderPlan:
     """The images to render for each command to an environment; None requests everything.
 
-    Args:
-        policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
+    policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
     """
 
     def __init__(self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings) -> None:

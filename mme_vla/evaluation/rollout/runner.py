@@ -15,7 +15,7 @@ import numpy as np
 
 from mme_vla.envs import metadata
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.curves import EXTRA as PROCESS
 from mme_vla.evaluation.rollout.episode import RunningEpisode
@@ -33,8 +33,7 @@ from mme_vla.subgoal import SubgoalPredictor
 class Waiting:
     """Episodes in the order they begin.
 
-    Args:
-        jobs: all that are left. claims: where other processes run the same ones; each then begins what it could claim.
+    jobs: all that are left. claims: where other processes run the same ones; each then begins what it could claim.
     """
 
     def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
@@ -170,11 +169,11 @@ class Rollout:
             if not reply.crashed:
                 running.end(reply.info)
             self._stillborn += not running.chunks
-            if self._stillborn >= GIVE_UP_AFTER:
-                raise UserError(
-                    f"{self._stillborn} environments in a row could not be started, so the run stops; the last one: "
-                    f"{reply.info.get('error_message')}"
-                )
+            require(
+                self._stillborn < GIVE_UP_AFTER,
+                f"{self._stillborn} environments in a row could not be started, so the run stops; the last one: "
+                f"{reply.info.get('error_message')}",
+            )
             self._finish(running, str(reply.info.get("status")), reply.info.get("error_message"))
             return
         if reply.reward is None:
@@ -189,11 +188,11 @@ class Rollout:
     def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
         """Let the episode begin once more if images of its video are needed that it did not draw."""
         missing, length = self._render_plan.missing(reply.observation), len(reply.observation["state"]) - 1
-        if running.redrawn not in (None, length):
-            raise UserError(
-                f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
-                "again: the environment does not repeat itself. Set draw=all."
-            )
+        require(
+            running.redrawn in (None, length),
+            f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
+            "again: the environment does not repeat itself. Set draw=all.",
+        )
         if missing is None:
             return False
         running.redrawn = length

@@ -14,14 +14,13 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Method, Results
-from mme_vla.evaluation.results.tables import Table
+from mme_vla.evaluation.results.aggregate import Results
+from mme_vla.evaluation.results.tables import Table, task_table
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.subgoal.text import mark_points
 
-EXTRA = "subgoals"
-"""Where a record keeps its score, in `EpisodeRecord.extra`."""
+EXTRA = "subgoals"  # Where a record keeps its score, in `EpisodeRecord.extra`
 
 
 @dataclass
@@ -46,8 +45,7 @@ class SubgoalScore:
     def add(self, predicted: str | None, meant: str | None, queried: bool = False, problem: str = "") -> None:
         """Count one subgoal.
 
-        Args:
-            predicted: the policy's subgoal; None while there is none. meant: the environment's; None where it has none.
+        predicted: the policy's subgoal; None while there is none. meant: the environment's; None where it has none.
         """
         self.chunks += 1
         self.asked += queried
@@ -117,21 +115,14 @@ def point_distances(predicted: str | None, meant: str) -> list[float] | None:
 
 
 def subgoal_tables(results: Results) -> list[Table]:
-    """Subgoals of every method that has a predictor."""
-    return [table for method in results.methods if (table := subgoal_table(method, results))]
-
-
-def subgoal_table(method: Method, results: Results) -> Table | None:
-    """Subgoals of one method per task, over all its runs; None for a method without."""
-    records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
-    if not records:
-        return None
-    by_task = {task: [r for r in records if r.task == task] for task in results.protocol.tasks}
-    rows = [_row(task, members) for task, members in by_task.items() if members]
-    rows.append(_row("all", records))
+    """Subgoals of every method that has a predictor, per task, over all its runs."""
     columns = ["", "episodes", "subgoals", "right words (%)", "distance (pixels)", "asked", "unusable answers"]
-    title = f"{method.label}: subgoals beside the environment's own"
-    return Table(title, columns, rows, {len(rows) - 1}, {len(rows) - 1})
+    tables = []
+    for method in results.methods:
+        records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
+        title = f"{method.label}: subgoals beside the environment's own"
+        tables += task_table(title, columns, records, results.protocol.tasks, _row)
+    return tables
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
@@ -145,8 +136,7 @@ def _normalised(words: str) -> str:
     return " ".join(words.lower().split()).rstrip(".")
 
 
-SUBGOALS = "subgoals"
-"""Name of the folder within a run."""
+SUBGOALS = "subgoals"  # Name of the folder within a run
 
 
 class SubgoalTrace:
@@ -156,8 +146,7 @@ class SubgoalTrace:
     on. A subgoal that was kept, or came in the background, is older: `asked_step` is the step of its question.
     What an earlier try of the same episode left there is replaced.
 
-    Args:
-        kind: `simple` or `grounded`. folder: None keeps the score alone. name: of the episode.
+    kind: `simple` or `grounded`. folder: None keeps the score alone. name: of the episode.
     """
 
     def __init__(self, kind: str, folder: Path | None, name: str) -> None:
@@ -173,9 +162,8 @@ class SubgoalTrace:
     def add(self, episode: SubgoalEpisode, subgoal: Subgoal, latency_s: float) -> None:
         """Note the subgoal that the policy acts on now.
 
-        Args:
-            episode: as the predictor knows it, its last frame and report the current ones.
-            latency_s: seconds the policy waited for it.
+        episode: as the predictor knows it, its last frame and report the current ones. latency_s: seconds the policy
+        waited for it.
         """
         # Between two sub-tasks the environment names none, and the last one stays, as in training.
         self._meant = online_subgoal(episode.info, self._kind) or self._meant

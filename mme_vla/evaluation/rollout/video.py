@@ -11,9 +11,7 @@ import numpy as np
 from mme_vla.utils import draft_of
 from mme_vla.utils.media import VideoWriter, video_frame
 
-SAVE_ON = ("none", "all", "success", "failure")
-BEHIND = 64
-"""Frames that may wait to be compressed."""
+BEHIND = 64  # Frames that may wait to be compressed
 _LONGEST_GOAL = 100  # characters of a file name
 
 
@@ -23,9 +21,7 @@ class EpisodeVideo:
     A thread compresses beside the simulation, which waits only when it is `BEHIND` frames ahead.
     The file gets its name, with the outcome, when the episode is over; until then it is a hidden file beside it.
 
-    Args:
-        path: of the video, from outcome and goal.
-        kept: which outcomes are kept: `all`, `success` or `failure`.
+    path: of the video, from outcome and goal. kept: which outcomes are kept: `all`, `success` or `failure`.
     """
 
     def __init__(self, path: Callable[[str, str], Path], save_on: str = "all") -> None:

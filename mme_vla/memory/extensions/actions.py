@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, check_sizes
 from mme_vla.memory.base import ProprioMemory
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import (
@@ -145,8 +145,7 @@ class ActionMemory(RecurrentMemory, ProprioMemory):
             budget: memory tokens. hidden: width of the LSTM; None is a quarter of `d_vision`, at least 64.
             layers: of the LSTM. max_steps, max_video, stride: which frames it reads.
         """
-        if budget < 1 or layers < 1:
-            raise UserError(f"memory.budget={budget}, memory.layers={layers}: both must be at least 1.")
+        check_sizes("memory", budget=budget, layers=layers)
         hidden = default_hidden(d_vision, hidden)
         layer = LSTMLayer(hidden, layers, budget, max_steps)
         options |= {"grid": 1, "max_steps": max_steps, "max_video": max_video, "stride": stride}

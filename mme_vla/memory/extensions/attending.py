@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.errors import UserError
+from mme_vla.errors import require
 from mme_vla.memory.base import MemoryModule, all_patches, union_frames
 from mme_vla.memory.history import History
 
@@ -19,8 +19,7 @@ MLP = 4
 def heads_of(hidden: int, heads: int | None) -> int:
     """So many heads; None is one for each 64 of `hidden`, at least 2."""
     heads = heads or max(2, hidden // 64)
-    if heads < 1 or hidden % heads:
-        raise UserError(f"memory.heads={heads} does not divide memory.hidden={hidden}.")
+    require(heads >= 1 and hidden % heads == 0, f"memory.heads={heads} does not divide memory.hidden={hidden}.")
     return heads
 
 

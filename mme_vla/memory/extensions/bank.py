@@ -12,11 +12,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.errors import UserError, did_you_mean
-from mme_vla.memory.base import recurrent_frames
+from mme_vla.errors import check_choice, check_sizes, require
 from mme_vla.memory.extensions.attending import FrameMemory, by_frame
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden
+from mme_vla.memory.recurrent import default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -34,6 +33,7 @@ class Banked(FrameMemory):
         budget: int = 64,
         grid: int = 8,
         pooling: str = "mean",
+        *,
         stride: int = 16,
         moments: int = 32,
         video: int = 16,
@@ -55,13 +55,13 @@ class Banked(FrameMemory):
             length, retrieval_layers, time_code, fusion, consolidation: as for `MemoryBank`.
         """
         super().__init__()
-        for key, value in {"grid": grid, "stride": stride, "video": video}.items():
-            if value < 1:
-                raise UserError(f"memory.{key}={value} must be at least 1.")
-        if moments < 2 or video >= moments:
-            raise UserError(f"memory.moments={moments} must be at least 2, and more than memory.video={video}.")
-        if budget < grid**2:
-            raise UserError(f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}.")
+        check_sizes("memory", grid=grid, stride=stride, video=video)
+        require(
+            1 < moments > video, f"memory.moments={moments} must be at least 2, and more than memory.video={video}."
+        )
+        require(
+            budget >= grid**2, f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}."
+        )
         hidden = default_hidden(d_vision, hidden)
         self.budget, self.stride, self.moments, self.video = grid**2, stride, moments, video
         self.storage = StorageSpec(grid, pooling)
@@ -164,10 +164,8 @@ class Retrieval(nn.Module):
             fusion: how current and retrieved tokens become one: `gate` (learned, each number its own) or `add` (mean).
         """
         super().__init__()
-        if retrieval_layers < 1:
-            raise UserError(f"bank.retrieval_layers={retrieval_layers} must be at least 1.")
-        if fusion not in FUSIONS:
-            raise UserError(f"bank.fusion={fusion!r}. {did_you_mean(str(fusion), FUSIONS)}")
+        check_sizes("bank", retrieval_layers=retrieval_layers)
+        check_choice("bank.fusion", fusion, FUSIONS)
         self.width = width
         self.blocks = nn.ModuleList(RetrievalBlock(width, read) for _ in range(retrieval_layers))
         self.gate = nn.Linear(2 * width, width) if fusion == "gate" else None
@@ -233,10 +231,8 @@ class MemoryBank(Retrieval):
                 drops the oldest.
             store_fused: store the fused tokens instead of the current ones.
         """
-        if length < 1:
-            raise UserError(f"bank.length={length} must be at least 1.")
-        if consolidation not in CONSOLIDATIONS:
-            raise UserError(f"bank.consolidation={consolidation!r}. {did_you_mean(str(consolidation), CONSOLIDATIONS)}")
+        check_sizes("bank", length=length)
+        check_choice("bank.consolidation", consolidation, CONSOLIDATIONS)
         super().__init__(width, retrieval_layers, time_code, fusion)
         self.length, self.consolidation, self.store_fused = length, consolidation, store_fused
 

@@ -13,13 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
-from mme_vla.memory.base import recurrent_frames
-from mme_vla.memory.encoder import FeatureEncoder
+from mme_vla.errors import check_sizes, require
+from mme_vla.memory.base import FeatureEncoder
 from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden
+from mme_vla.memory.recurrent import default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -36,6 +35,7 @@ class Gist(FrameMemory):
         d_vision: int,
         width: int,
         budget: int = 512,
+        *,
         anchors: int = 2,
         recent: int = 4,
         gists: int = 8,
@@ -59,16 +59,13 @@ class Gist(FrameMemory):
             encoder: `position_dim` and `position_hidden` of both `FeatureEncoder`s.
         """
         super().__init__()
-        sizes = {"anchors": anchors, "recent": recent, "gists": gists, "stride": stride, "layers": layers}
-        for key, value in sizes.items():
-            if value < 1:
-                raise UserError(f"memory.{key}={value} must be at least 1.")
+        check_sizes("memory", anchors=anchors, recent=recent, gists=gists, stride=stride, layers=layers)
         full_tokens = (anchors + recent) * grid**2
-        if budget < full_tokens + gists:
-            raise UserError(
-                f"memory.budget={budget} does not hold {anchors + recent} whole frames of {grid}×{grid} tokens and the "
-                f"gists of one more: choose at least {full_tokens + gists}, or fewer memory.anchors or memory.recent."
-            )
+        require(
+            budget >= full_tokens + gists,
+            f"memory.budget={budget} does not hold {anchors + recent} whole frames of {grid}×{grid} tokens and the "
+            f"gists of one more: choose at least {full_tokens + gists}, or fewer memory.anchors or memory.recent.",
+        )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
         self.anchors, self.recent, self.gists, self.stride = anchors, recent, gists, stride

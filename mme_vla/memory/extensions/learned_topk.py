@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule, all_patches, union_frames
-from mme_vla.memory.encoder import FeatureEncoder, position_features
+from mme_vla.errors import require
+from mme_vla.memory.base import FeatureEncoder, MemoryModule, all_patches, position_features, union_frames
 from mme_vla.memory.extensions.attending import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
@@ -41,6 +40,7 @@ class LearnedTopK(MemoryModule):
         d_vision: int,
         width: int,
         budget: int = 256,
+        *,
         pool: int = 64,
         grid: int = 4,
         pooling: str = "mean",
@@ -63,16 +63,16 @@ class LearnedTopK(MemoryModule):
             encoder: `position_dim` and `position_hidden` of both `FeatureEncoder`s.
         """
         super().__init__()
-        if not 2 <= budget <= pool * grid**2:
-            raise UserError(
-                f"memory.budget={budget} must lie between 2 and the {pool * grid**2} tokens of memory.pool={pool} "
-                f"frames of {grid}×{grid}: what it does not hold is chosen from."
-            )
-        if temperature <= 0 or layers < 1 or registers < 0:
-            raise UserError(
-                f"memory.temperature={temperature}, memory.layers={layers}, memory.registers={registers}: the first "
-                "must be positive, the second at least 1, the third at least 0."
-            )
+        require(
+            2 <= budget <= pool * grid**2,
+            f"memory.budget={budget} must lie between 2 and the {pool * grid**2} tokens of memory.pool={pool} "
+            f"frames of {grid}×{grid}: what it does not hold is chosen from.",
+        )
+        require(
+            temperature > 0 and layers >= 1 and registers >= 0,
+            f"memory.temperature={temperature}, memory.layers={layers}, memory.registers={registers}: the first "
+            "must be positive, the second at least 1, the third at least 0.",
+        )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
         self.budget, self.pool, self.temperature = budget, pool, temperature

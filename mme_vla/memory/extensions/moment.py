@@ -14,12 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
-from mme_vla.memory.base import recurrent_frames
-from mme_vla.memory.encoder import FeatureEncoder
+from mme_vla.errors import check_sizes, require
+from mme_vla.memory.base import FeatureEncoder
 from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden
+from mme_vla.memory.recurrent import default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -57,11 +56,10 @@ class Moment(FrameMemory):
             encoder: `position_dim` and `position_hidden` of the `FeatureEncoder`.
         """
         super().__init__()
-        for key, value in {"moments": moments, "stride": stride, "layers": layers}.items():
-            if value < 1:
-                raise UserError(f"memory.{key}={value} must be at least 1.")
-        if budget % moments or budget < moments:
-            raise UserError(f"memory.budget={budget} must be a multiple of memory.moments={moments}: whole frames.")
+        check_sizes("memory", moments=moments, stride=stride, layers=layers)
+        require(
+            budget % moments == 0 < budget, f"memory.budget={budget} must be a multiple of memory.moments={moments}."
+        )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
         self.budget, self.moments, self.stride, self.steps = budget, moments, stride, budget // moments

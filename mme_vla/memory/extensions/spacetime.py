@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, check_sizes, require
 from mme_vla.memory.base import MemoryModule, PastViewMemory, PastViewSpec, ProprioMemory, union_frames
 from mme_vla.memory.extensions.actions import NEVER, MotionRows
 from mme_vla.memory.history import History, StorageSpec
@@ -58,15 +58,16 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
             budget: most memory tokens there is room for; None for as many as there are frames, which it takes at least.
         """
         super().__init__()
-        for name, value in {"frames": frames, "stride": stride, "every": every, "state_dim": state_dim}.items():
-            if value < 1:
-                raise UserError(f"memory.{name}={value} must be at least 1.")
-        if not (views or states):
-            raise UserError("memory.views=false and memory.states=false leave nothing to remember: set one of them.")
-        if budget is not None and states and budget < frames:
-            raise UserError(f"memory.budget={budget}: the states of memory.frames={frames} are as many tokens.")
-        if states and state_dim > d_vision:
-            raise UserError(f"memory.state_dim={state_dim}: this backbone's tokens, {d_vision} wide, carry the states.")
+        check_sizes("memory", frames=frames, stride=stride, every=every, state_dim=state_dim)
+        require(
+            views or states, "memory.views=false and memory.states=false leave nothing to remember: set one of them."
+        )
+        enough = budget is None or not states or budget >= frames
+        require(enough, f"memory.budget={budget}: the states of memory.frames={frames} are as many tokens.")
+        require(
+            not states or state_dim <= d_vision,
+            f"memory.state_dim={state_dim}: tokens {d_vision} wide carry the states.",
+        )
         self.frames, self.stride, self.every = frames, stride, every
         self.width, self.state_dim = width, state_dim
         self.d_vision = d_vision

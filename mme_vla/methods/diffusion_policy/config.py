@@ -6,7 +6,7 @@ from typing import Any, Self
 
 from mme_vla.backbone.config import VisionConfig
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 
 NAME = "diffusion_policy"
 LARGEST = 2**16
@@ -55,20 +55,20 @@ class DiffusionSizes:
             if value == () or not all(1 <= n <= LARGEST for n in numbers):
                 where = "processor" if f.name == "window" else "backbone"  # which the backbone follows
                 raise UserError(f"{where}.{f.name}={brief(value)} must be made of whole numbers from 1 to {LARGEST}.")
-        if not 0 < self.crop <= 1:
-            raise UserError(f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
+        require(0 < self.crop <= 1, f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
         halved = 2 ** (len(self.widths) - 1)
-        if self.horizon % halved:
-            raise UserError(
-                f"embodiment.action.horizon={self.horizon} must be a multiple of {halved}: each of the U-Net's "
-                f"{len(self.widths)} levels (backbone.widths) but the last halves the chunk."
-            )
-        if self.window > self.horizon:
-            raise UserError(f"processor.window={self.window} frames leave no action of a chunk of {self.horizon}.")
-        if self.step_width % 2 or self.step_width < 4:
-            raise UserError(f"backbone.step_width={self.step_width} must be even and at least 4: sines and cosines.")
-        if not self.kernel % 2:
-            raise UserError(f"backbone.kernel={self.kernel} must be odd, so that a chunk keeps its length.")
+        require(
+            self.horizon % halved == 0,
+            f"embodiment.action.horizon={self.horizon} must be a multiple of {halved}: each of the U-Net's "
+            f"{len(self.widths)} levels (backbone.widths) but the last halves the chunk.",
+        )
+        require(
+            self.window <= self.horizon,
+            f"processor.window={self.window} leaves no action of a chunk of {self.horizon}.",
+        )
+        even = self.step_width % 2 == 0 and self.step_width >= 4
+        require(even, f"backbone.step_width={self.step_width} must be even and at least 4: sines and cosines.")
+        require(self.kernel % 2, f"backbone.kernel={self.kernel} must be odd, so that a chunk keeps its length.")
         if bad := [width for width in self.widths if width % self.groups]:
             raise UserError(f"backbone.widths: {bad[0]} is no multiple of backbone.groups={self.groups}.")
         if self.widths[0] % 8:

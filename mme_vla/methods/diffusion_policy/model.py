@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.pi05 import initialise
 from mme_vla.backbone.siglip import VisionTower, pool_grid
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import missing_extra, require
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
-from mme_vla.speed.recompute import Recompute, run_layer
+from mme_vla.speed import Recompute, run_layer
 
 if TYPE_CHECKING:
     from torch.nn import GroupNorm
@@ -76,8 +76,7 @@ def sample(
         fresh: [b, steps − 1, h, a], what is added after each step but the last. steps: fewer than the schedule's.
     """
     total = int(schedule.config.num_train_timesteps)
-    if steps is not None and not 1 <= steps <= total:
-        raise UserError(f"flow_steps={steps}: Diffusion Policy samples in 1 to {total} steps.")
+    require(steps is None or 0 < steps <= total, f"flow_steps={steps}: Diffusion Policy samples in 1 to {total} steps.")
     schedule.set_timesteps(steps or total)
     x = start
     for i, step in enumerate(schedule.timesteps.tolist()):
@@ -133,11 +132,6 @@ class SpatialSoftmax(nn.Module):
         weights = maps.flatten(2).softmax(-1)
         height, width = maps.shape[-2:]
         return weights @ cell_centres(height, width, maps.device).to(weights)
-
-
-def keypoint_pool(keypoints: int) -> nn.Sequential:
-    """Maps → [n, 2·keypoints]: x0, y0, x1, … As trained, a ReLU follows: what lies left or above has a 0 there."""
-    return nn.Sequential(SpatialSoftmax(CHANNELS, keypoints), nn.Flatten(), nn.ReLU())
 
 
 FINAL_GROUPS = 8
@@ -272,7 +266,8 @@ class DiffusionNetwork(nn.Module):
             self.vision = VisionTower(sizes.memory_tower, sizes.memory_width)
             initialise(self.vision)
         self.image_encoder = build_image_encoder()
-        self.image_pool = keypoint_pool(sizes.keypoints)
+        # Keypoints x0, y0, x1, … As trained, a ReLU follows: what lies left or above has a 0 there.
+        self.image_pool = nn.Sequential(SpatialSoftmax(CHANNELS, sizes.keypoints), nn.Flatten(), nn.ReLU())
         self.text_proj = nn.Sequential(
             nn.LayerNorm(sizes.text_dim),
             nn.Linear(sizes.text_dim, sizes.text_hidden),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.integration.film import PooledIntegration
 from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.diffusion_policy import model
@@ -19,10 +19,10 @@ from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import MemoryTower, NetworkPolicy
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, own_processor
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
@@ -80,11 +80,11 @@ class DiffusionPolicy(NetworkPolicy):
         if (integration is None) != (not config.get("memory")):
             mismatch = "a memory without an integration" if integration is None else "an integration without a memory"
             raise UserError(f"This configuration names {mismatch}; name both, or neither.")
-        if robot.action.width != sizes.action_dim:
-            raise UserError(
-                f"backbone.action_dim={sizes.action_dim}: Diffusion Policy predicts the robot's own "
-                f"{robot.action.width} numbers an action; leave it to the embodiment."
-            )
+        require(
+            robot.action.width == sizes.action_dim,
+            f"backbone.action_dim={sizes.action_dim}: Diffusion Policy predicts the robot's own "
+            f"{robot.action.width} numbers an action; leave it to the embodiment.",
+        )
         feature = 0 if integration is None else integration.feature_width
         network = DiffusionNetwork(sizes, len(robot.cameras), robot.state.width, feature, integration is not None)
         memory: Memory | None = None
@@ -92,8 +92,7 @@ class DiffusionPolicy(NetworkPolicy):
             grid = sizes.memory_tower.image_size // sizes.memory_tower.patch_size
             memory = build_memory(config["memory"], sizes.memory_width, grid, integration.memory_width)
             check_past(config, memory, frozenset())
-        if processor is not None and not isinstance(processor, DiffusionProcessor):
-            raise UserError("Diffusion Policy needs its own processor: set processor=dp, or dp_tiny to try things out.")
+        processor = own_processor(DiffusionProcessor, processor, "dp, or dp_tiny to try things out")
         return cls(network, memory, integration, processor, config, **policy_options(cls, config))
 
     # Training

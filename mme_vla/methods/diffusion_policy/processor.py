@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.embodiment.action_space import integer
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
+from mme_vla.errors import UserError, brief, check_choice, check_whole, did_you_mean, missing_extra, require
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
 from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, Sample, SampleSpec, StatsSpec
@@ -70,11 +69,11 @@ class ClipText(GoalEncoder):
                 "is kept, give a folder that holds it (processor.text=<folder>), or try things out with "
                 "processor.text=hashed."
             ) from None
-        if tower.config.projection_dim != self.width:
-            raise UserError(
-                f"{self.source} gives {tower.config.projection_dim} numbers a text, the network reads {self.width}: "
-                "set backbone.text_dim."
-            )
+        require(
+            tower.config.projection_dim == self.width,
+            f"{self.source} gives {tower.config.projection_dim} numbers a text, the network reads {self.width}: "
+            "set backbone.text_dim.",
+        )
         return tokenizer, tower.eval().requires_grad_(False)
 
     def encode(self, text: str) -> Tensor:
@@ -87,13 +86,6 @@ class ClipText(GoalEncoder):
 def text_features(tower: "CLIPTextModelWithProjection", ids: Tensor, mask: Tensor) -> Tensor:
     """Token ids and mask [b, l] → the projected state of each end of text, of unit length [b, d]."""
     return functional.normalize(tower(input_ids=ids, attention_mask=mask).text_embeds, dim=-1)
-
-
-def text_encoder(name: str, width: int) -> GoalEncoder:
-    """The encoder called `hashed` or `clip`, or a CLIP in a folder of one's own."""
-    if name == HASHED:
-        return HashedWords(width)
-    return ClipText(width, CLIP if name == "clip" else name)
 
 
 FRAMES = ("consecutive", "asked")
@@ -143,18 +135,19 @@ class DiffusionProcessor(PolicyProcessor):
             window: frames of an observation. frames: `consecutive`, or `asked`: those at which the policy was asked.
             memory_size: side of the images that a memory's vision tower reads.
         """
-        if frames not in FRAMES:
-            raise UserError(f"processor.frames={brief(frames)}. {did_you_mean(str(frames), FRAMES)}")
-        if isinstance(window, bool) or not isinstance(window, int) or not 1 <= window <= 64:
-            raise UserError(f"processor.window={brief(window)} must be a whole number from 1 to 64.")
-        if not isinstance(text, str) or not text:
-            raise UserError(f"processor.text={brief(text)} must be clip, hashed, or the folder of a CLIP.")
+        check_choice("processor.frames", frames, FRAMES)
+        check_whole("processor.window", window, 64)
+        require(
+            text and isinstance(text, str), f"processor.text={brief(text)} must be clip, hashed, or a CLIP's folder."
+        )
         height, width = picture
-        self.picture = (integer(height, "processor.picture"), integer(width, "processor.picture"))
+        self.picture = (check_whole("processor.picture", height), check_whole("processor.picture", width))
         self.embodiment = embodiment
-        self.text_name, self.text = text, text_encoder(text, integer(text_dim, "processor.text_dim"))
+        width = check_whole("processor.text_dim", text_dim)
+        folder = CLIP if text == CLIP_NAME else text
+        self.text_name, self.text = text, HashedWords(width) if text == HASHED else ClipText(width, folder)
         self.samples = SampleSpec(window=window, consecutive=frames == FRAMES[0])
-        self.memory_size = integer(memory_size, "processor.memory_size")
+        self.memory_size = check_whole("processor.memory_size", memory_size)
         self.stats = stats
 
     @classmethod
@@ -182,8 +175,7 @@ class DiffusionProcessor(PolicyProcessor):
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
         """Images of all cameras [v, 3, H, W] uint8, or [n, v, 3, H, W]; with black bars where the shape is another."""
         names = self.embodiment.camera_names
-        if len(views) != len(names):
-            raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
+        require(len(views) == len(names), f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.picture) for view in views]
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3)))
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.config import check_positive
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import check_choice, check_multiple
 
 STEPS = 100
 LARGEST_BETA = 0.999
@@ -90,12 +90,8 @@ class DitConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "head.")
-        if self.width % self.num_heads:
-            raise UserError(f"head.width={self.width} must be a multiple of num_heads={self.num_heads}.")
-        if self.perceptual_init not in INITS:
-            raise UserError(
-                f"head.perceptual_init={self.perceptual_init!r}. {did_you_mean(self.perceptual_init, INITS)}"
-            )
+        check_multiple("head.", "width", self.width, "num_heads", self.num_heads)
+        check_choice("head.perceptual_init", self.perceptual_init, INITS)
 
 
 def step_features(steps: Tensor) -> Tensor:

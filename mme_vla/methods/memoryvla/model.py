@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import additive_mask
-from mme_vla.errors import UserError
+from mme_vla.backbone.layers import additive_mask
+from mme_vla.errors import check_sizes, require
 from mme_vla.integration.base import required
 from mme_vla.memory.extensions.bank import BankState, MemoryBank, Retrieval
 from mme_vla.methods.memoryvla.action_head import Dit, DitConfig, Schedule
@@ -98,14 +98,11 @@ class MemoryVlaConfig:
     guidance: float = 1.5
 
     def __post_init__(self) -> None:
-        integers = {name: value for name, value in vars(self).items() if isinstance(value, int)}
-        for name, value in integers.items():
-            if value < 1:
-                raise UserError(f"backbone.{name}={value} must be at least 1.")
-        if not 0 <= self.dropout < 1:
-            raise UserError(f"backbone.dropout={self.dropout} must lie in [0, 1).")
-        if self.guidance < 1:
-            raise UserError(f"backbone.guidance={self.guidance} must be at least 1 (no guidance).")
+        for name, value in vars(self).items():
+            if isinstance(value, int):
+                check_sizes("backbone", **{name: value})
+        require(0 <= self.dropout < 1, f"backbone.dropout={self.dropout} must lie in [0, 1).")
+        require(self.guidance >= 1, f"backbone.guidance={self.guidance} must be at least 1 (no guidance).")
 
 
 @dataclass(frozen=True)

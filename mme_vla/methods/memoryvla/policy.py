@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.config import shapes_only
+from mme_vla.backbone.building import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.memoryvla.episode import MemoryVlaEpisode, words
 from mme_vla.methods.memoryvla.model import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core, read_moments
@@ -22,12 +22,12 @@ from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import MemoryTower, NetworkPolicy
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, own_processor
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
@@ -88,13 +88,12 @@ class MemoryVlaPolicy(NetworkPolicy):
                 f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}: its own retrieval "
                 "reads a memory, in place of its banks. Set integration=none."
             )
-        if processor is not None and not isinstance(processor, MemoryVlaProcessor):
-            raise UserError("MemoryVLA needs its own processor: set processor=memoryvla, or memoryvla_tiny to try it.")
-        if processor is not None and processor.samples.group_size == 1 and not config.get("memory"):
-            raise UserError(
-                "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
-                "or more, or a memory in place of the banks (memory=framesamp)."
-            )
+        processor = own_processor(MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it")
+        require(
+            not (processor is not None and processor.samples.group_size == 1 and not config.get("memory")),
+            "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
+            "or more, or a memory in place of the banks (memory=framesamp).",
+        )
         with nullcontext() if fresh_backbone else shapes_only():
             vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
         if not fresh_backbone:

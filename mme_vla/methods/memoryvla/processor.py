@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import check_whole, require
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles, OpenVlaProcessor
@@ -68,8 +68,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
         size = config.get("group_size", GROUP_SIZE)
-        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
-            raise UserError(f"processor.group_size must be a positive whole number, not {brief(size)}.")
+        check_whole("processor.group_size", size)
         built = super().from_config({key: value for key, value in config.items() if key != "group_size"})
         built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
         return built
@@ -81,11 +80,11 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         sizes = read_section(MemoryVlaConfig, of_network, "backbone")
         options = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
         built = cls.from_config({**sections["processor"], **options, "embodiment": embodiment_of(sections).to_dict()})
-        if built.tokenizer.vocab_size > sizes.vocab_size:
-            raise UserError(
-                f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but "
-                f"backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the backbone."
-            )
+        require(
+            built.tokenizer.vocab_size <= sizes.vocab_size,
+            f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but "
+            f"backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the backbone.",
+        )
         return built
 
     def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:

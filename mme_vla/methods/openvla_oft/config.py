@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from mme_vla.backbone.config import check_positive
-from mme_vla.errors import UserError
+from mme_vla.errors import check_multiple, check_sizes, require
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,8 @@ class TowerConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "a vision tower's ")
-        if self.depth < 2:
-            raise UserError(f"A vision tower of depth={self.depth} has no block before its last: at least 2.")
-        if self.width % self.num_heads:
-            raise UserError(f"A vision tower's width={self.width} must be a multiple of num_heads={self.num_heads}.")
+        require(self.depth >= 2, f"A vision tower of depth={self.depth} has no block before its last: at least 2.")
+        check_multiple("vision.", "width", self.width, "num_heads", self.num_heads)
 
 
 @dataclass(frozen=True)
@@ -34,11 +32,8 @@ class FusedVisionConfig:
     siglip: TowerConfig = field(default_factory=lambda: TowerConfig(1152, 27, 4304, 16))
 
     def __post_init__(self) -> None:
-        for name, value in (("image_size", self.image_size), ("patch_size", self.patch_size)):
-            if value < 1:
-                raise UserError(f"vision.{name}={value} must be at least 1.")
-        if self.image_size % self.patch_size:
-            raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
+        check_sizes("vision", image_size=self.image_size, patch_size=self.patch_size)
+        check_multiple("vision.", "image_size", self.image_size, "patch_size", self.patch_size)
 
     @property
     def width(self) -> int:
@@ -67,8 +62,7 @@ class LlamaConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "vlm.")
-        if self.width % (2 * self.num_heads):
-            raise UserError(f"vlm.width={self.width} must be a multiple of 2 · num_heads={self.num_heads}.")
+        check_multiple("vlm.", "width", self.width, "2 · num_heads", 2 * self.num_heads)
 
 
 @dataclass(frozen=True)
@@ -89,10 +83,10 @@ class OpenVlaConfig:
     horizon: int = 20
 
     def __post_init__(self) -> None:
-        for name in ("vocab_size", "end_id", "action_dim", "horizon"):
-            if getattr(self, name) < 1:
-                raise UserError(f"backbone.{name}={getattr(self, name)} must be at least 1.")
-        if self.state_dim < 0:
-            raise UserError(f"backbone.state_dim={self.state_dim} must be at least 0.")
-        if self.end_id >= self.vocab_size:
-            raise UserError(f"backbone.end_id={self.end_id} is no token of vocab_size={self.vocab_size}.")
+        check_sizes(
+            "backbone", **{name: getattr(self, name) for name in ("vocab_size", "end_id", "action_dim", "horizon")}
+        )
+        require(self.state_dim >= 0, f"backbone.state_dim={self.state_dim} must be at least 0.")
+        require(
+            self.end_id < self.vocab_size, f"backbone.end_id={self.end_id} is no token of vocab_size={self.vocab_size}."
+        )

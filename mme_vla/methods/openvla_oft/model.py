@@ -7,13 +7,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import Block, additive_mask
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
+from mme_vla.backbone.layers import Block, additive_mask
 from mme_vla.methods.openvla_oft.config import OpenVlaConfig
 from mme_vla.methods.prismatic import Prismatic
 from mme_vla.registry import BACKBONES
-from mme_vla.speed import Recomputes, Sharded
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute, Recomputes, Sharded
 from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch
 

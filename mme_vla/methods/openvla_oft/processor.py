@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import brief, require
 from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
 from mme_vla.processing.images import as_uint8_frames, hsv_to_rgb, rgb_to_hsv, to_unit_range
 from mme_vla.processing.processor import Processor
@@ -61,10 +61,10 @@ class ClippedQuantiles:
         return np.where(self.scaled, np.where(self.still, 0.0, y), 0.0)
 
     def _on(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        if not x.is_floating_point() or x.shape[-1] != len(self.low):
-            raise UserError(
-                f"Statistics of {len(self.low)} numbers do not fit values {x.dtype} of shape {list(x.shape)}."
-            )
+        require(
+            x.is_floating_point() and x.shape[-1] == len(self.low),
+            f"Statistics of {len(self.low)} numbers do not fit values {x.dtype} of shape {list(x.shape)}.",
+        )
         still = self.still if len(self.still) else np.zeros(len(self.low), bool)
         scaled, motionless = (torch.from_numpy(flag).to(x.device) for flag in (self.scaled, still))
         return x.new_tensor(self.low), x.new_tensor(self.high - self.low + EPSILON), scaled, motionless
@@ -229,14 +229,13 @@ class OpenVlaProcessor(Processor):
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `Processor.from_config`, with `jpeg` beside the other settings."""
         jpeg = config.get("jpeg", False)
-        if not isinstance(jpeg, bool):
-            raise UserError(f"processor.jpeg must be true or false, not {brief(jpeg)}.")
+        require(isinstance(jpeg, bool), f"processor.jpeg must be true or false, not {brief(jpeg)}.")
         built = super().from_config({key: value for key, value in config.items() if key not in ("name", "jpeg")})
-        if built.embodiment.action.width != built.action_dim:
-            raise UserError(
-                f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the robot's, "
-                f"{built.embodiment.action.width}."
-            )
+        require(
+            built.embodiment.action.width == built.action_dim,
+            f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the robot's, "
+            f"{built.embodiment.action.width}.",
+        )
         built.jpeg = jpeg
         return built
 

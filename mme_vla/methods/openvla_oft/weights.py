@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
@@ -79,15 +79,16 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     """The base's tensors (behind `vla/`) with a run's adapters folded in: W + (alpha / rank)·B·A."""
     settings, file = _settings(folder), folder / FOLDER / FILE
     rank, alpha = settings.get("r"), settings.get("lora_alpha")
-    if not isinstance(rank, int) or not isinstance(alpha, int | float) or rank < 1:
-        raise UserError(f"{folder / FOLDER / SETTINGS} has r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.")
+    require(
+        isinstance(rank, int) and isinstance(alpha, int | float) and rank >= 1,
+        f"{folder / FOLDER / SETTINGS} has r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.",
+    )
     if other := [name for name in ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern") if settings.get(name)]:
         raise UserError(f"{folder / FOLDER / SETTINGS} sets {listed(other)}, which are not read: merge it with peft.")
     adapters = read_files(folder / FOLDER, (file,))
     downs = [name for name in adapters if name.startswith(_BEFORE) and name.endswith(_DOWN)]
     odd = sorted(set(adapters) - set(downs) - {name.removesuffix(_DOWN) + _UP for name in downs})
-    if odd or not downs:
-        raise UserError(f"{file} holds {listed(odd or list(adapters))}, no adapters of OpenVLA-OFT.")
+    require(not odd and downs, f"{file} holds {listed(odd or list(adapters))}, no adapters of OpenVLA-OFT.")
     out = dict(base)
     for name in downs:
         target = VLA + name.removeprefix(_BEFORE).removesuffix(_DOWN) + ".weight"
@@ -98,8 +99,10 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
         # A convolution's A is [r, in, k, k] and its B [out, r, 1, 1]: the product of their rows and columns.
         product = up.float().flatten(1) @ down
         weight = out[target]
-        if product.shape != weight.flatten(1).shape:
-            raise UserError(f"{file}: {name} makes {list(product.shape)} of {list(weight.shape)}: another base's.")
+        require(
+            product.shape == weight.flatten(1).shape,
+            f"{file}: {name} makes {list(product.shape)} of {list(weight.shape)}: another base's.",
+        )
         out[target] = (weight.float() + alpha / rank * product.view_as(weight)).to(weight.dtype)
     return out
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, check_multiple, require
 from mme_vla.methods.sam2act.geometry import VIEWS
 
 LEVELS = 4
@@ -34,8 +34,9 @@ class EncoderSizes:
     def __post_init__(self) -> None:
         _check_sizes(self, "backbone.encoder")
         for name in ("blocks", "windows"):
-            if len(getattr(self, name)) != LEVELS:
-                raise UserError(f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage.")
+            require(
+                len(getattr(self, name)) == LEVELS, f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage."
+            )
         if any(place >= sum(self.blocks) for place in self.global_blocks):
             raise UserError(f"backbone.encoder.global_blocks={list(self.global_blocks)}: there are {sum(self.blocks)}.")
 
@@ -84,14 +85,11 @@ class SAM2ActSizes:
 
     def __post_init__(self) -> None:
         _check_sizes(self, "backbone")
-        if self.width % self.heads:
-            raise UserError(f"backbone.width={self.width} must be a multiple of backbone.heads={self.heads}.")
-        if self.depth % 2:
-            raise UserError(f"backbone.depth={self.depth} must be even: half of the layers see one view alone.")
-        if self.token % 4 or self.memory % 4:
-            raise UserError(f"Tokens ({self.token}) and memories ({self.memory}) need widths that are multiples of 4.")
-        if 360 % self.rotation_bins:
-            raise UserError(f"backbone.rotation_bins={self.rotation_bins} must divide a turn of 360 degrees.")
+        check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)
+        check_multiple("backbone.", "depth", self.depth, "pairs", 2)  # half of the layers see one view alone
+        for name in ("token", "memory"):
+            check_multiple("backbone.encoder.", name, getattr(self, name), "quarters", 4)
+        require(360 % self.rotation_bins == 0, f"backbone.rotation_bins={self.rotation_bins} must divide 360 degrees.")
 
     @property
     def side(self) -> int:
@@ -112,5 +110,7 @@ class SAM2ActSizes:
 def _check_sizes(sizes: Any, where: str) -> None:
     for name, value in vars(sizes).items():
         for number in value if isinstance(value, tuple) else [value]:
-            if isinstance(number, int) and not 1 <= number <= LARGEST:
-                raise UserError(f"{where}.{name}={brief(value)}: sizes are whole numbers from 1 to {LARGEST}.")
+            require(
+                not (isinstance(number, int) and not 1 <= number <= LARGEST),
+                f"{where}.{name}={brief(value)}: sizes are whole numbers from 1 to {LARGEST}.",
+            )

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.methods.sam2act.geometry import ZOOM, Cube, PointFinder, angles_of_bins, zoom_back
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import SAM2ActProcessor, Shot, cloud_images, zoomed_images
@@ -113,10 +113,13 @@ class KeyframeEpisode(Episode):
             rendered: the same frames for every camera; depth and poses are given for these alone.
         """
         self._check_readings(frames)
-        if rendered is not None and any(
-            not np.array_equal(rendered[n], places) for places in rendered.values() for n in rendered
-        ):
-            raise UserError("This policy sees through all of its cameras at once: draw the same frames of each.")
+        require(
+            not (
+                rendered is not None
+                and any(not np.array_equal(rendered[n], places) for places in rendered.values() for n in rendered)
+            ),
+            "This policy sees through all of its cameras at once: draw the same frames of each.",
+        )
         super().observe(frames, states, is_demo, actions, rendered)
         demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
         places = range(len(demo)) if rendered is None else next(iter(rendered.values())).tolist()
@@ -186,12 +189,11 @@ class KeyframeEpisode(Episode):
             images = np.asarray(frames[camera.name])
             depth, pose = camera.readings
             for name, shape in ((depth, (*images.shape[:3], 1)), (pose, (len(images), 3, 4))):
-                if name not in frames:
-                    raise UserError(
-                        f"observe() needs {name!r} beside the camera {camera.name!r}; got {sorted(frames)}."
-                    )
+                require(
+                    name in frames, f"observe() needs {name!r} beside the camera {camera.name!r}; got {sorted(frames)}."
+                )
                 readings = np.asarray(frames[name])
-                if readings.shape not in (shape, shape[:3]) or readings.dtype.kind not in "fiu":
-                    raise UserError(
-                        f"{name} must be {list(shape)} numbers; got {readings.dtype} {list(readings.shape)}."
-                    )
+                require(
+                    readings.shape in (shape, shape[:3]) and readings.dtype.kind in "fiu",
+                    f"{name} must be {list(shape)} numbers; got {readings.dtype} {list(readings.shape)}.",
+                )

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.geometry import VIEWS, project, read_maps
 from mme_vla.methods.sam2act.sam2 import BankState, ImageEncoder, KeyframeBank, released_positions
-from mme_vla.speed.recompute import Recompute, run_layer
+from mme_vla.speed import Recompute, run_layer
 
 _NEIGHBOURS = 9
 _MASK_SCALE = 0.1  # as released

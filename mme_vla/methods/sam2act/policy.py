@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import check_choice, require
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.episode import KeyframeEpisode, SceneInputs, decide, watch
 from mme_vla.methods.sam2act.geometry import ZOOM, Cube, PointFinder, heatmap_loss, shift_and_rotate, to_bins
@@ -19,10 +19,10 @@ from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import NAME, KeyframeBatch, SAM2ActProcessor, cloud_images, zoomed_images
 from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import NetworkPolicy
+from mme_vla.policy.network import NetworkPolicy, own_processor
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import POLICIES
-from mme_vla.speed.recompute import Recompute
+from mme_vla.speed import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import Noise, map_noise
 
@@ -139,8 +139,7 @@ STAGES = {
 
 
 def check_stage(stage: str) -> str:
-    if stage not in STAGES:
-        raise UserError(f"Unknown training stage {brief(stage)} of SAM2Act+. {did_you_mean(str(stage), STAGES)}")
+    check_choice("stage", stage, STAGES)
     return stage
 
 
@@ -192,15 +191,16 @@ class SAM2ActPolicy(NetworkPolicy):
         cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
         sizes, robot = SAM2ActSizes.from_dict(config["backbone"]), embodiment_of(config)
-        if robot.action.width != WIDTH or robot.action.frames is not None or robot.action.horizon != 1:
-            raise UserError(
-                f"SAM2Act+ predicts one planned motion of {WIDTH} numbers; the robot {robot.name!r} is asked for "
-                f"chunks of {robot.action.horizon} × {robot.action.width}. Set embodiment=robomme_keyframes."
-            )
-        if config.get("memory") or config.get("integration"):
-            raise UserError("SAM2Act+ has a memory of its own: set memory=none integration=none.")
-        if processor is not None and not isinstance(processor, SAM2ActProcessor):
-            raise UserError("SAM2Act+ needs its own processor: set processor=sam2act_plus.")
+        require(
+            robot.action.width == WIDTH and robot.action.frames is None and robot.action.horizon == 1,
+            f"SAM2Act+ predicts one planned motion of {WIDTH} numbers; the robot {robot.name!r} is asked for "
+            f"chunks of {robot.action.horizon} × {robot.action.width}. Set embodiment=robomme_keyframes.",
+        )
+        require(
+            not config.get("memory") and not config.get("integration"),
+            "SAM2Act+ has a memory of its own: set memory=none integration=none.",
+        )
+        processor = own_processor(SAM2ActProcessor, processor, "sam2act_plus")
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
     @property

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, missing_extra
+from mme_vla.errors import UserError, brief, check_whole, missing_extra, require
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
 from mme_vla.methods.sam2act.geometry import (
     EMPTY,
@@ -170,11 +170,11 @@ class ClipTokens(GoalTokens):
                 f"No text tower of a CLIP at {self.folder} ({str(error).splitlines()[0]}). Give a folder that holds "
                 "one (processor.text=<folder>), or processor.text=hashed to try things out."
             ) from None
-        if tower.config.hidden_size != self.width:
-            raise UserError(
-                f"{self.folder} gives {tower.config.hidden_size} numbers a token, the network reads {self.width}: set "
-                "backbone.language."
-            )
+        require(
+            tower.config.hidden_size == self.width,
+            f"{self.folder} gives {tower.config.hidden_size} numbers a token, the network reads {self.width}: set "
+            "backbone.language.",
+        )
         return tokenizer, tower.eval().requires_grad_(False)
 
     @torch.no_grad()
@@ -185,11 +185,6 @@ class ClipTokens(GoalTokens):
         ids = read["input_ids"] * read["attention_mask"]
         states: Tensor = tower(input_ids=ids).last_hidden_state
         return states[0]
-
-
-def goal_tokens(name: str, width: int, words: int) -> GoalTokens:
-    """The encoder called `hashed`, or a CLIP in a folder."""
-    return HashedTokens(width, words) if name == HASHED else ClipTokens(width, words, name)
 
 
 NAME = "sam2act_plus"
@@ -226,6 +221,7 @@ class SAM2ActProcessor(PolicyProcessor):
         language: int = 512,
         words: int = 77,
         side: int = 128,
+        *,
         bounds: Sequence[float] = (-1, -1, -1, 1, 1, 1),
         trained_waypoints: int = 25,
         waypoints: int = 40,
@@ -243,27 +239,30 @@ class SAM2ActProcessor(PolicyProcessor):
             video_frames: frames of the conditioning video that are encoded, evenly spaced.
             field_of_view: of all cameras, in degrees; the benchmark's have 90.
         """
-        sizes = {"language": language, "words": words, "side": side, "trained_waypoints": trained_waypoints,
-                 "waypoints": waypoints, "video_frames": video_frames}  # fmt: skip
+        sizes = {"language": language, "words": words, "side": side, "video_frames": video_frames}
+        sizes |= {"trained_waypoints": trained_waypoints, "waypoints": waypoints}
         for name, value in sizes.items():
-            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST:
-                raise UserError(f"processor.{name}={brief(value)} must be a whole number from 1 to {LARGEST}.")
+            check_whole(f"processor.{name}", value, LARGEST)
         numbers = list(bounds)
         finite = len(numbers) == 6 and all(isinstance(n, int | float) and np.isfinite(n) for n in numbers)
-        if not finite or any(low >= high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
-            raise UserError(
-                f"processor.bounds={brief(numbers)} must be x, y, z of the lowest corner, then the highest."
-            )
-        if isinstance(field_of_view, bool) or not isinstance(field_of_view, int | float) or not 0 < field_of_view < 180:
-            raise UserError(f"processor.field_of_view={brief(field_of_view)} must lie between 0 and 180 degrees.")
-        if not isinstance(text, str) or not text:
-            raise UserError(f"processor.text={brief(text)} must be hashed, or the folder of a CLIP.")
+        require(
+            finite and not any(low >= high for low, high in zip(numbers[:3], numbers[3:], strict=True)),
+            f"processor.bounds={brief(numbers)} must be x, y, z of the lowest corner, then the highest.",
+        )
+        require(
+            not isinstance(field_of_view, bool) and isinstance(field_of_view, int | float) and 0 < field_of_view < 180,
+            f"processor.field_of_view={brief(field_of_view)} must lie between 0 and 180 degrees.",
+        )
+        require(
+            isinstance(text, str) and text, f"processor.text={brief(text)} must be hashed, or the folder of a CLIP."
+        )
         if blind := [camera.name for camera in embodiment.cameras if not camera.depth]:
             raise UserError(
                 f"SAM2Act+ needs depth of every camera; the robot {embodiment.name!r} gives none of {', '.join(blind)} "
                 "(embodiment.cameras.<name>.depth). Set embodiment=robomme_keyframes."
             )
-        self.embodiment, self.text_name, self.text = embodiment, text, goal_tokens(text, language, words)
+        self.embodiment, self.text_name = embodiment, text
+        self.text = HashedTokens(language, words) if text == HASHED else ClipTokens(language, words, text)
         self.side, self.cube = side, Cube.of(numbers)
         self.trained_waypoints, self.waypoints, self.video_frames = trained_waypoints, waypoints, video_frames
         self.field_of_view = float(field_of_view)

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.methods.sam2act.model import code_rates
 from mme_vla.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.base import Policy
@@ -202,8 +202,10 @@ def unwrap_sam2act_names(tensors: Mapping[str, Tensor], source: str) -> dict[str
     """Tensors by their names without wrapping, each copy of SAM2's compared with the original."""
     renamed = {name.removeprefix(_WRAPPED): tensor for name, tensor in tensors.items()}
     for copy, original in released_copies(renamed).items():
-        if copy in renamed and not torch.equal(renamed[copy], renamed[original]):
-            raise UserError(f"{source}: {copy} is another tensor than {original}, of which it should be a copy.")
+        require(
+            not (copy in renamed and not torch.equal(renamed[copy], renamed[original])),
+            f"{source}: {copy} is another tensor than {original}, of which it should be a copy.",
+        )
     return renamed
 
 

@@ -9,11 +9,11 @@ with the episodes that are missing, and the same input always gives the same fil
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
@@ -38,9 +38,6 @@ from mme_vla.utils import (
     write_sums,
 )  # fmt: skip
 from mme_vla.utils.media import png_bytes, write_video
-
-if TYPE_CHECKING:
-    pass
 
 PARTS = "parts"
 
@@ -80,8 +77,7 @@ def build(
 ) -> dict[str, int]:
     """Build these sets; return the number of rows of each."""
     options = options or RowOptions()
-    if not episodes or not sets:
-        raise UserError("There is nothing to build: name at least one episode and one of the sets.")
+    require(episodes and sets, "There is nothing to build: name at least one episode and one of the sets.")
     names = [episode.name for episode in episodes]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
@@ -94,11 +90,11 @@ def build(
 def _build(
     episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions, plan: dict[str, Any]
 ) -> dict[str, int]:
-    if not claim_plan(output, plan):
-        raise UserError(
-            f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
-            "repeat that command to finish it, or remove the folder yourself."
-        )
+    require(
+        claim_plan(output, plan),
+        f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
+        "repeat that command to finish it, or remove the folder yourself.",
+    )
     for folder in (output, *(path for path in output.rglob("*") if path.is_dir())):
         remove_drafts(folder)
     missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
@@ -125,31 +121,19 @@ def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], op
         for image, frame in built.images.items():
             paths_at.setdefault(frame, []).append(output / image)
         if built.video:
-            _write_once(output / built.video, partial(_write_video, episode, labels.exec_start))
+            path = output / built.video
+            if not path.is_file():
+                write_video(episode.read_images(range(labels.exec_start)), path, **ENCODING)
     missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(paths_at.items())}
     steps = [t for t, paths in missing.items() if paths]
     for t, pixels in zip(steps, episode.read_images(steps), strict=True):
         for path in missing[t]:
-            _write_once(path, partial(_write_png, pixels))
+            with write_atomically(path) as draft:
+                draft.write_bytes(png_bytes(pixels))
     for name in sets:  # the rows last: where they are, their images are
         rows = episode_rows(name, labels, options).rows
         with write_atomically(_part(output, name, episode)) as draft:
             draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
-
-
-def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(path)
-
-
-def _write_video(episode: Demonstration, length: int, path: Path) -> None:
-    write_video(episode.read_images(range(length)), path, **ENCODING)
-
-
-def _write_png(image: np.ndarray, path: Path) -> None:
-    with write_atomically(path) as draft:
-        draft.write_bytes(png_bytes(image))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:
@@ -159,16 +143,8 @@ def _part(output: Path, name: str, episode: Demonstration) -> Path:
 def _h5_readers(ref: EpisodeRef) -> tuple[Callable[[], Labels], Callable[[Sequence[int]], Iterator[np.ndarray]]]:
     def labels() -> Labels:
         with open_episode(ref) as episode:
-            texts = list(episode.subgoals())
-            return Labels(
-                ref.task,
-                ref.index,
-                episode.goals[0],
-                episode.exec_start,
-                [text["simple_subgoal"] for text in texts],
-                [text["grounded_subgoal"] for text in texts],
-                *episode.joints(),
-            )
+            texts = _two_kinds(list(episode.subgoals()))
+            return Labels(ref.task, ref.index, episode.goals[0], episode.exec_start, *texts, *episode.joints())
 
     def read_images(steps: Sequence[int]) -> Iterator[np.ndarray]:
         with open_episode(ref) as episode:
@@ -186,11 +162,11 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
     demonstrations = []
     for e in range(len(source)):
         task = task_names.get(str(e)) or source.task(e)
-        if not task:
-            raise UserError(
-                f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
-                'tasks=<file> with {"<episode index>": "<Task>", …}.'
-            )
+        require(
+            task,
+            f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
+            'tasks=<file> with {"<episode index>": "<Task>", …}.',
+        )
         record = source.records[e] if e < len(source.records) else {}
         number = record.get("source_episode", e)
         if type(number) is not int or not 0 <= number < 2**31:
@@ -210,18 +186,15 @@ def _read_tasks(path: Path) -> dict[str, str]:
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
     texts = [source.subgoals(episode, t) for t in range(int(source.lengths[episode]))]
-    return Labels(
-        task,
-        number,
-        source.goal(episode),
-        int(source.exec_starts[episode]),
-        [text["simple_subgoal"] for text in texts],
-        [text["grounded_subgoal"] for text in texts],
-        source.states(episode)[:, :ARM_JOINTS],
-        source.actions(episode)[:, :ARM_JOINTS],
-    )
+    joints, targets = source.states(episode)[:, :ARM_JOINTS], source.actions(episode)[:, :ARM_JOINTS]
+    start = int(source.exec_starts[episode])
+    return Labels(task, number, source.goal(episode), start, *_two_kinds(texts), joints, targets)
 
 
 def _lerobot_images(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
     for start in range(0, len(steps), 64):  # what is decoded at once stays small
         yield from source.frames(episode, list(steps[start : start + 64]))
+
+
+def _two_kinds(texts: Sequence[Mapping[str, str]]) -> tuple[list[str], list[str]]:
+    return [text["simple_subgoal"] for text in texts], [text["grounded_subgoal"] for text in texts]

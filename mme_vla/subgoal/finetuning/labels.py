@@ -40,7 +40,9 @@ class Labels:
 
     def __post_init__(self) -> None:
         for texts in (self.simple, self.grounded):
-            texts[:] = without_complete(texts)
+            for t, text in enumerate(texts):  # "complete" is no subgoal: the one before it stays
+                if t and text.strip().lower() == "complete":
+                    texts[t] = texts[t - 1]
 
     @property
     def length(self) -> int:
@@ -49,20 +51,11 @@ class Labels:
 
     @property
     def last(self) -> int:
-        """The last frame."""
         return self.length - 1
 
     def texts(self, kind: str) -> list[str]:
         """The subgoals of a kind, `simple` or `grounded`."""
         return {"simple": self.simple, "grounded": self.grounded}[kind]
-
-
-def without_complete(texts: Sequence[str]) -> list[str]:
-    """Replace "complete", which is no subgoal, by the one before it."""
-    result: list[str] = []
-    for text in texts:
-        result.append(result[-1] if result and text.strip().lower() == "complete" else text)
-    return result
 
 
 def changes(labels: Labels) -> list[int]:
@@ -108,11 +101,18 @@ def keyframes(labels: Labels, substring_match: bool = False) -> list[int]:
     starts = changes(labels)
     frames = [t for t in starts if t != labels.last]
     bounds = sorted({*starts, labels.last})
-    for segment, count in enumerate(_midpoints(labels.task, substring_match)):
+    task = "ButtonUnmaskSwap" if substring_match and labels.task in "ButtonUnmaskSwap" else labels.task
+    for segment, count in enumerate(_MIDPOINTS.get(task, ())):
         if segment + 1 < len(bounds):
             frames += np.linspace(bounds[segment], bounds[segment + 1], count + 2)[1:-1].astype(int).tolist()
     if labels.task in _STILL:
-        return _merged([*frames, *resting_frames(labels)])
+        merged: list[int] = []
+        for frame in sorted([*frames, *resting_frames(labels)]):  # the running midpoint of those closer than 10
+            if merged and frame - merged[-1] < _MERGE:
+                merged[-1] = (merged[-1] + frame) // 2
+            else:
+                merged.append(frame)
+        return merged
     return sorted(set(frames))
 
 
@@ -158,20 +158,3 @@ def windows(labels: Labels, targets: Sequence[int], one_a_window: bool = False) 
             rows.append(Window(list(past), frames, [frames.index(f) + 1 for f in matches]))
             past, frames, matches = past + matches, [], []
     return rows
-
-
-def _midpoints(task: str, substring_match: bool) -> Sequence[int]:
-    if substring_match and task in "ButtonUnmaskSwap":
-        task = "ButtonUnmaskSwap"
-    return _MIDPOINTS.get(task, ())
-
-
-def _merged(frames: Sequence[int]) -> list[int]:
-    """Join frames closer than 10 into one, the running midpoint."""
-    merged: list[int] = []
-    for frame in sorted(frames):
-        if merged and frame - merged[-1] < _MERGE:
-            merged[-1] = (merged[-1] + frame) // 2
-        else:
-            merged.append(frame)
-    return merged

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.subgoal.answers import SubgoalHistory
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps, windows
@@ -73,8 +73,7 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
     Args:
         name: a key of `SETS`.
     """
-    if name not in SETS:
-        raise UserError(f"sets: {name!r}. {did_you_mean(str(name), SETS)}")
+    require(name in SETS, f"sets: {name!r}. {did_you_mean(str(name), SETS)}")
     folder, kind = SETS[name]
     build = _memer if folder == "memer" else _qwenvl
     stem = f"{folder}/images/{labels.task}_ep{labels.number}"
@@ -143,12 +142,10 @@ _TIME = 12  # tokens of a video frame's time stamp, at most
 def read_rows(file: str | Path) -> list[Row]:
     """Read a JSON-lines file."""
     path = Path(file)
-    if not path.is_file():
-        raise UserError(f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
+    require(path.is_file(), f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
     Sums(path.parent, remedy="Build the training data again").check(path.name)
     rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
-    if not rows:
-        raise UserError(f"{path} holds no row.")
+    require(rows, f"{path} holds no row.")
     return rows
 
 
@@ -174,15 +171,14 @@ def _fault(row: Row) -> str:
             return f"{key} is {brief(names)}, not a list of files"
     objects = row.get("objects", {})
     points = objects.get("bbox", []) if isinstance(objects, dict) else None
-    if not isinstance(points, list) or not all(_is_point(point) for point in points):
+    if not isinstance(points, list) or not all(
+        isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
+        for point in points
+    ):
         return f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
     if (marks := texts[1].count(BBOX) + texts[2].count(BBOX)) != len(points):
         return f"it has {marks} marks {BBOX} for {len(points)} points"
     return ""
-
-
-def _is_point(point: object) -> bool:
-    return isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
 
 
 def texts_of(row: Row) -> tuple[str, str, str]:
@@ -214,11 +210,11 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         example = next((name for row in rows for name in row.get("images", [])), None)
         if example is None:
             raise UserError(f"{file} has no row with an image. Build the training data again.")
-        image = _image_tokens(read_image(inside(self.folder, example, "picture")).shape)
+        height, width, _ = read_image(inside(self.folder, example, "picture")).shape
+        image = min(max(round(height / TOKEN_SIDE) * round(width / TOKEN_SIDE), 4), IMAGE_TOKENS)
         self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
         self.left_out = len(rows) - len(self.rows)
-        if not self.rows:
-            raise UserError(f"All rows of {file} are longer than max_length={max_length}; raise it.")
+        require(self.rows, f"All rows of {file} are longer than max_length={max_length}; raise it.")
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -244,7 +240,6 @@ class Collator:
         return batch
 
     def labels(self, ids: Tensor) -> Tensor:
-        """Labels [n] of one conversation [n]."""
         listed = ids.tolist()
         width = len(self.start)
         starts = [i for i in range(len(listed) - width + 1) if listed[i : i + width] == self.start]
@@ -280,10 +275,6 @@ def hf_dataset(file: str | Path) -> Any:
         videos=List(Value("string")),
     )
     return Dataset.from_dict(columns, features=features)
-
-
-def _image_tokens(shape: Sequence[int]) -> int:
-    return min(max(round(shape[0] / TOKEN_SIDE) * round(shape[1] / TOKEN_SIDE), 4), IMAGE_TOKENS)
 
 
 def _longest(row: Row, tokenizer: Any, image: int) -> int:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.subgoal.finetuning.rows import Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
 
@@ -57,7 +57,6 @@ def write_arguments(folder: Path, name: str) -> Path:
 
 
 def command(name: str) -> str:
-    """The command line that goes with it."""
     return " ".join([*(f"{key}={value}" for key, value in ENVIRONMENT.items()), "swift sft", f"swift_{name}.json"])
 
 
@@ -77,11 +76,11 @@ ZERO2 = {
 def accumulation(batch: int, per_device: int, processes: int) -> int:
     """Batches added up before a step, so that all processes together see `batch` rows."""
     together = per_device * processes
-    if batch % together:
-        raise UserError(
-            f"batch={batch} is no multiple of per_device_batch={per_device} times {processes} processes; "
-            f"choose numbers that divide."
-        )
+    require(
+        not (batch % together),
+        f"batch={batch} is no multiple of per_device_batch={per_device} times {processes} processes; "
+        f"choose numbers that divide.",
+    )
     return batch // together
 
 

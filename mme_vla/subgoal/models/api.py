@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.models.connection import (
     Connection,
@@ -123,13 +123,6 @@ class Api:
                 self._connection = CONNECTIONS[self.provider](self.settings, self.client)
             return self._connection
 
-    def _needed(self) -> Connection:
-        try:
-            return self._connected()
-        except UserError as error:
-            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
-            raise UserError(f"{error}{hint}") from None
-
     def ask(self, system: str, messages: Sequence[Message]) -> Reply:
         """Ask the last turn of a conversation.
 
@@ -155,7 +148,11 @@ class Api:
         return reply
 
     def _tried(self, system: str, messages: Sequence[Message]) -> Reply:
-        connection = self._needed()
+        try:
+            connection = self._connected()
+        except UserError as error:
+            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
+            raise UserError(f"{error}{hint}") from None
         pause = self.settings.backoff
         failure = ApiFailure("failed", "never asked")
         for attempt in range(self.settings.retries + 1):
@@ -173,7 +170,7 @@ class Api:
                     break
             except Exception as error:  # whatever the network and the client come up with
                 reason = self._redacted(f"{type(error).__name__}: {error}")
-                if self._is_fatal(error):
+                if _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower()):
                     raise UserError(
                         f"{self.settings.model} cannot be asked: {reason}. Check the key in "
                         f"${self.settings.key_variable} and the model's name."
@@ -230,9 +227,6 @@ class Api:
                 text = text.replace(secret, "***")
         return text
 
-    def _is_fatal(self, error: Exception) -> bool:
-        return _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower())
-
 
 def _read_reply(path: Path) -> Reply | None:
     """An answer that was kept; None where there is none, or its file is damaged."""
@@ -267,6 +261,5 @@ def make_api(provider: str, settings: Mapping[str, Any], where: str, usage: Usag
     Args:
         provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
     """
-    if provider not in CONNECTIONS:
-        raise UserError(f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
+    require(provider in CONNECTIONS, f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
     return Api(read_section(CONNECTIONS[provider].settings_type, settings, where), usage, client, provider=provider)

@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from mme_vla.config.sections import NonNegative, NonNegativeInt, Positive, Range
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, missing_extra, require
 from mme_vla.subgoal.clips import ENCODING, sample_video
 from mme_vla.utils.media import png_bytes, video_bytes
 
@@ -44,7 +44,6 @@ class Settings:
 
     @property
     def key(self) -> str:
-        """The key, empty where there is none."""
         return "" if self.key_variable is None else os.environ.get(self.key_variable, "")
 
     @property
@@ -61,7 +60,6 @@ class MediaPart:
     _encoded: dict[str, Any] = field(default_factory=dict)
 
     def once[T](self, form: str, encode: Callable[[np.ndarray], T]) -> T:
-        """What is sent in this form."""
         if form not in self._encoded:
             self._encoded[form] = encode(self.pixels)
         encoded: T = self._encoded[form]
@@ -116,7 +114,6 @@ class GoogleConnection(Connection):
         self._settings, self._client = settings, client or _google_client(settings)
 
     def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
-        """See `Connection`."""
         response = self._client.models.generate_content(
             model=self._settings.model,
             contents=[{"role": role, "parts": [_part(part) for part in parts]} for role, parts in messages],
@@ -129,8 +126,7 @@ class GoogleConnection(Connection):
 
 
 def _google_client(settings: Settings) -> Any:
-    if not settings.key:
-        raise UserError(f"Gemini needs a key in the environment variable {settings.key_variable}.")
+    require(settings.key, f"Gemini needs a key in the environment variable {settings.key_variable}.")
     try:
         from google import genai
     except ImportError:
@@ -141,13 +137,13 @@ def _google_client(settings: Settings) -> Any:
 def _part(part: Any) -> Mapping[str, Any]:
     if isinstance(part, str):
         return {"text": part}
-    return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", _inline)
 
+    def inline(pixels: np.ndarray) -> Mapping[str, Any]:
+        is_image = pixels.ndim == 3
+        data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
+        return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
 
-def _inline(pixels: np.ndarray) -> Mapping[str, Any]:
-    is_image = pixels.ndim == 3
-    data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
-    return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
+    return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", inline)
 
 
 def _refusal(response: Any) -> str:
@@ -181,8 +177,10 @@ class OpenAISettings(Settings):
     video_frames: Annotated[int, Range(least=2)] = 10
 
     def __post_init__(self) -> None:
-        if self.video_frames % 2:
-            raise UserError(f"video_frames={self.video_frames} must be an even number of images, 2 or more.")
+        require(
+            not (self.video_frames % 2),
+            f"video_frames={self.video_frames} must be an even number of images, 2 or more.",
+        )
         if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
             shown = self.base_url.rpartition("@")[2]  # without a password
             raise UserError(f"base_url={shown!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
@@ -214,7 +212,6 @@ class OpenAIConnection(Connection):
         self._settings, self._client = settings, client or _openai_client(settings)
 
     def ask(self, system: str, conversation: Sequence[Message]) -> RawReply:
-        """See `Connection`."""
         messages: list[dict[str, Any]] = [{"role": "system", "content": system}]
         messages += [
             {"role": "assistant" if role == "model" else role, "content": self._content(role, parts)}
@@ -256,11 +253,11 @@ class OpenAIConnection(Connection):
 
 
 def _openai_client(settings: OpenAISettings) -> Any:
-    if settings.key_variable is not None and not settings.key:
-        raise UserError(
-            f"{settings.model} needs a key in the environment variable {settings.key_variable}; an endpoint that asks "
-            "for none has key_variable=null."
-        )
+    require(
+        settings.key_variable is None or settings.key,
+        f"{settings.model} needs a key in the environment variable {settings.key_variable}; an endpoint that asks "
+        "for none has key_variable=null.",
+    )
     try:
         import openai
     except ImportError:

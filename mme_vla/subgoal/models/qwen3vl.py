@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean, missing_extra
+from mme_vla.errors import UserError, did_you_mean, missing_extra, require
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.tiny import make_tiny
 from mme_vla.subgoal.text import IMAGE, VIDEO, split_media
@@ -145,8 +145,7 @@ class VLM:
 
 def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
     """A model and its processor, on the CPU."""
-    if dtype not in DTYPES:
-        raise UserError(f"dtype={dtype!r} of a Qwen3-VL. {did_you_mean(str(dtype), DTYPES)}")
+    require(dtype in DTYPES, f"dtype={dtype!r} of a Qwen3-VL. {did_you_mean(str(dtype), DTYPES)}")
     try:
         from transformers import AutoProcessor, Qwen3VLForConditionalGeneration
     except ImportError:
@@ -162,8 +161,7 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
 
 
 def _check_batch(size: int) -> None:
-    if not isinstance(size, int) or size < 1:
-        raise UserError(f"batch_size={size!r} must be a whole number, 1 or more.")
+    require(isinstance(size, int) and size >= 1, f"batch_size={size!r} must be a whole number, 1 or more.")
 
 
 def limit_images(processor: Any) -> None:

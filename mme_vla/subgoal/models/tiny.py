@@ -91,7 +91,6 @@ def tiny_config(processor: Any) -> Any:
 
 
 def make_tiny(seed: int = 0) -> tuple[Any, Any]:
-    """The model in eval mode, and its processor."""
     import torch
     from transformers import Qwen3VLForConditionalGeneration
 

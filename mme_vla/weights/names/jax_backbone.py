@@ -1,6 +1,6 @@
 """The released (JAX) names of the backbone's tensors. VLM leaves have no suffix, the action expert's end in `_1`."""
 
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.config import BackboneConfig
 from mme_vla.backbone.gemma import ExpertLayer
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.weights.tables import NameTable, Piece, Unread, linear, prefixed
@@ -33,7 +33,15 @@ def released_unread(backbone: Pi05Backbone) -> list[Unread]:
     for name, expert in experts.items():
         if name in SUFFIX and name != backbone.transformer.action_expert:
             gaps.append(Unread(f"PaliGemma/llm/final_norm{SUFFIX[name]}/scale", (expert.width,)))
-            gaps += _unread_layer(config, expert, SUFFIX[name])
+            suffix, last, d, f = SUFFIX[name], config.depth - 1, expert.width, expert.mlp_dim
+            heads, h = config.num_heads, config.head_dim
+            gaps += [
+                Unread(f"{LAYERS}/attn/q_einsum{suffix}/w", (heads, d, h), last),
+                Unread(f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", (heads, h, d), last),
+                Unread(f"{LAYERS}/mlp{suffix}/gating_einsum", (2, d, f), last),
+                Unread(f"{LAYERS}/mlp{suffix}/linear", (f, d), last),
+                Unread(f"{LAYERS}/pre_ffw_norm{suffix}/scale", (d,), last),
+            ]
     return gaps
 
 
@@ -61,20 +69,7 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, suffix: str, i: in
     return table | norm("mlp_norm", "pre_ffw_norm")
 
 
-def _unread_layer(config: BackboneConfig, expert: ExpertConfig, suffix: str) -> list[Unread]:
-    last, d, f = config.depth - 1, expert.width, expert.mlp_dim
-    heads, h = config.num_heads, config.head_dim
-    return [
-        Unread(f"{LAYERS}/attn/q_einsum{suffix}/w", (heads, d, h), last),
-        Unread(f"{LAYERS}/attn/attn_vec_einsum{suffix}/w", (heads, h, d), last),
-        Unread(f"{LAYERS}/mlp{suffix}/gating_einsum", (2, d, f), last),
-        Unread(f"{LAYERS}/mlp{suffix}/linear", (f, d), last),
-        Unread(f"{LAYERS}/pre_ffw_norm{suffix}/scale", (d,), last),
-    ]
-
-
 def _vision(config: BackboneConfig) -> NameTable:
-    """The table of timm's transformer, which keeps q, k and v in one matrix."""
     root, heads = "PaliGemma/img", config.vision.num_heads
     axes = {"n": heads, "h": config.vision.width // heads}
     table: NameTable = {

@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from mme_vla.memory.base import Memory
-from mme_vla.memory.encoder import PerceptualMemory
+from mme_vla.memory.base import Memory, PerceptualMemory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.memory.rmt import RMTLayer, angles
 from mme_vla.memory.ttt import TTTLayer

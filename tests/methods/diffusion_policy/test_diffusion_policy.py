@@ -1,42 +1,24 @@
-"""`diffusion_policy` learns, resumes, comes back from a folder, acts in episodes, and hands its weights on."""
+"""`diffusion_policy` comes back from a folder, acts in episodes, and hands its weights on."""
 
 import sys
-import time
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 pytest.importorskip("diffusers")
 
-from rich.console import Console
 
-from helpers.rollout_fakes import JOBS, InlineEnvs, roll
-from helpers.serving_fakes import Served, acted_directly, challenge, course
-from mme_vla import MMEPolicy, Policy, UserError, build_policy, load_weights
-from mme_vla.cli.inspect import show_checkpoint
-from mme_vla.cli.train import train
+from mme_vla import Policy, UserError, build_policy, load_weights
 from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
-from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import moving_frames, unit_stats
-
-SHORT = [
-    "logger=none", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=2",
-    "train.log_every=1", "backbone.diffusion_steps=4",
-]  # fmt: skip
-
-
-RECIPE = ["train.schedule=cosine", "train.schedule_steps=3", "train.warmup_from_zero=true", "train.warmup=1",
-          "train.decay_min_dim=2", "train.ema_warmup=true", "train.weight_decay=1e-2"]  # fmt: skip
 
 
 def ready(name: str = "diffusion_policy", **overrides: Any) -> DiffusionPolicy:
@@ -51,39 +33,8 @@ def policy() -> DiffusionPolicy:
     return ready()
 
 
-@cache
-def composed() -> DictConfig:
-    return compose("train", ["model=diffusion_policy", *SHORT, *RECIPE])
-
-
-def run(folder: Path, steps: int, resume: Path | None = None, chunks: int = 0) -> Path:
-    """Train so many updates with the authors' recipe in small, drawing so many chunks; the last checkpoint."""
-    cfg = composed().copy()
-    cfg.train.open_loop_chunks, cfg.train.val_samples = chunks, 2 * chunks
-    cfg.train.steps, cfg.resume = steps, None if resume is None else str(resume)
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    return train(cfg, config, folder, begun=time.perf_counter())
-
-
 def views(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     return {"front": moving_frames(count, seed=seed), "wrist": moving_frames(count, seed=seed + 1)}
-
-
-def test_it_trains_on_the_sample_and_resumes_to_the_bit(tmp_path: Path) -> None:
-    straight = run(tmp_path / "whole", 3, chunks=1)
-    run(tmp_path / "parts", 2)
-    resumed = load_tensors(run(tmp_path / "unused", 3, resume=tmp_path / "parts"))
-    for name, tensor in load_tensors(straight).items():
-        assert torch.equal(tensor, resumed[name]), name
-    again = Policy.from_pretrained(straight)
-    assert isinstance(again, DiffusionPolicy) and again.require_processor().stats is not None
-    assert again.embodiment.action.execute == 8
-    console = Console(record=True, width=200)
-    show_checkpoint(straight, console)
-    output = console.export_text()
-    assert all(word in output for word in ("encoder", "text", "action", "hashed", "11,305,900"))
-    with pytest.raises(UserError, match=r"holds a 'diffusion_policy' policy.*Policy.from_pretrained"):
-        MMEPolicy.from_pretrained(straight)
 
 
 def test_weights_go_to_the_authors_format_and_back(policy: DiffusionPolicy, tmp_path: Path) -> None:
@@ -103,12 +54,6 @@ def test_weights_go_to_the_authors_format_and_back(policy: DiffusionPolicy, tmp_
     )
     loaded, original = (each.require_processor().require_stats() for each in (back, policy))
     np.testing.assert_array_equal(loaded.actions.max, original.actions.max)
-
-
-def test_a_pth_of_objects_is_not_run(policy: DiffusionPolicy, tmp_path: Path) -> None:
-    torch.save({"model": Path("x")}, tmp_path / "model.pth")
-    with pytest.raises(UserError, match="objects, which are code"):
-        load_weights(policy, tmp_path / "model.pth")
 
 
 def test_an_episode_sees_what_training_shows() -> None:
@@ -172,20 +117,6 @@ def test_a_batch_is_cropped_at_one_place_and_the_centre_when_acting(policy: Diff
         policy.eval()
     assert len({crop.flatten()[0].item() for crop in crops}) > 1
     assert all((crop == crop[:1, :, :1]).all() for crop in crops)
-
-
-def test_rollouts_execute_half_a_chunk(policy: DiffusionPolicy) -> None:
-    (record,) = roll(policy, JOBS[:1], InlineEnvs(max_steps=20))
-    assert policy.embodiment.action.execute == policy.horizon // 2 == 8
-    assert record.steps > 8 and record.extra["chunks"] == -(-record.steps // 8)
-
-
-def test_it_is_served_as_it_acts(policy: DiffusionPolicy) -> None:
-    (front, wrist, state), *_ = parts = course(video=0, rounds=1)
-    with Served(policy) as served, served.client() as client:
-        chunk = client.infer(challenge(front, wrist, state, True))["actions"]
-    expected = acted_directly(policy, parts[:1])[0]
-    np.testing.assert_allclose(chunk, expected[: policy.embodiment.action.execute], atol=1e-5)
 
 
 @pytest.mark.parametrize("module", ["diffusers", "torchvision.models"])

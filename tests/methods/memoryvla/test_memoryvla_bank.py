@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of, runs_of
+from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of
 from mme_vla.methods.memoryvla.action_head import Dit, DitConfig, Schedule
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
 from mme_vla.methods.memoryvla.weights import memoryvla_table
@@ -27,30 +27,6 @@ def one_by_one(bank: MemoryBank, tokens: Tensor, times: Tensor) -> tuple[Tensor,
 
 
 @torch.no_grad()
-def test_groups_side_by_side_equal_streams_one_by_one() -> None:
-    """Also where the last group is shorter and the banks overflow."""
-    bank = MemoryBank(8, length=3)
-    tokens, times = moments(12)
-    together, states = bank.run(tokens, times, groups_of(12, 5))
-    for group, state in zip(groups_of(12, 5), states, strict=True):
-        alone, last = one_by_one(bank, tokens[group], times[group])
-        torch.testing.assert_close(together[group], alone)
-        assert torch.equal(state.times, last.times) and torch.equal(state.entries, last.entries)
-
-
-@torch.no_grad()
-def test_banks_of_different_fill_reply_in_one_batch_as_alone() -> None:
-    bank = MemoryBank(8, length=4)
-    tokens, times = moments(5)
-    states = [one_by_one(bank, tokens[:4], times)[1], bank.init_state(3), one_by_one(bank, tokens[:2], times)[1]]
-    now = moments(3, seed=1)[0]
-    together = bank.read(states, now)
-    for state, moment, output in zip(states, now, together, strict=True):
-        torch.testing.assert_close(bank.read([state], moment[None])[0], output)
-    torch.testing.assert_close(bank.retrieve(states, now)[1], now[1])
-
-
-@torch.no_grad()
 def test_of_equal_moments_the_first_two_become_one_and_of_none_the_earlier_time_stays() -> None:
     bank = MemoryBank(8, length=4)
     tokens = moments(1)[0].repeat(5, 1, 1)
@@ -67,11 +43,6 @@ def test_what_is_stored_carries_no_gradient_and_what_is_read_does() -> None:
     assert not state.entries.requires_grad
     (gradient,) = torch.autograd.grad(fused[1].sum(), tokens)
     assert gradient[0].abs().sum() == 0 and gradient[1].abs().sum() > 0
-
-
-def test_runs_end_where_the_episode_changes() -> None:
-    runs = runs_of(torch.tensor([7, 7, 3, 7, 7]))
-    assert [run.tolist() for run in runs] == [[0, 1], [2], [3, 4]]
 
 
 @pytest.mark.parametrize(
@@ -96,15 +67,6 @@ def test_a_fresh_head_does_not_hear_the_perceptual_tokens_until_it_is_reported_t
         torch.nn.init.normal_(head.output.weight)
         read = [head(x, torch.tensor([1, 2]), torch.ones(2, 1, 8), tokens) for tokens in (per, per + 1)]
         assert torch.equal(*read) is not reads_tokens
-
-
-def test_guidance_of_one_is_no_guidance() -> None:
-    torch.manual_seed(0)
-    head = Dit(DitConfig(16, 1, 2), action_dim=4, horizon=5, d_cognition=8, d_perceptual=10)
-    torch.nn.init.normal_(head.output.weight)
-    inputs = torch.randn(2, 5, 4), torch.tensor([1, 2]), torch.randn(2, 1, 8), torch.randn(2, 6, 10)
-    assert torch.equal(head.guided(*inputs, 1.0), head(*inputs))
-    assert not torch.allclose(head.guided(*inputs, 2.0), head(*inputs))
 
 
 def test_full_size_parameters_are_the_originals_to_the_number() -> None:

@@ -1,6 +1,5 @@
 """MemoryVLA with a memory of the library in place of its banks: it learns, acts, is served and probed as any policy."""
 
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,29 +8,14 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from rich.console import Console
 
 from helpers.memoryvla_golden import reached
-from helpers.prior_vla_runs import losses, run
-from helpers.rollout_fakes import InlineEnvs, roll
-from helpers.scripted_env import make_scripted_env
-from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError, build_policy
-from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
-from mme_vla.data.sources import open_sources
-from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.recordings import all_recordings
 from mme_vla.memory.base import full_history, stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, RecallingCore
 from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
-from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config, policy_words
-from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.tensor_files import load_tensors
-from mme_vla.probing.arms import read_arms
-from mme_vla.probing.lines import MomentLine
-from mme_vla.probing.offline import OfflineSettings, probe_offline
 from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames
 from mme_vla.training.data import check_frozen, prepare_data
 from mme_vla.types import HistoryTokens
@@ -170,65 +154,6 @@ def test_an_episode_stores_as_a_sample_does_and_saves_nothing(policy: MemoryVlaP
     assert policy.frames_read(np.array([11]), 5).tolist() == list(range(12))  # type: ignore[union-attr]
 
 
-WORDS = {
-    "framesamp": ["memory=framesamp", "memory.every=8", "processor.group_size=2", "train.open_loop_chunks=1"],
-    "ttt": ["memory=ttt", "memory.grid=4", "processor.group_size=2"],
-    "alone": ["memory=framesamp", "memory.every=8", "processor.group_size=1"],  # each sample a step by itself
-}
-SMALL = ["backbone.vision.image_size=28", "backbone.head.depth=1", "train.batch_size=2", "processor.jpeg=false"]
-
-
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of runs, which share one cache."""
-    return tmp_path_factory.mktemp("runs")
-
-
-@pytest.fixture(scope="module", params=WORDS)
-def trained(request: pytest.FixtureRequest, runs: Path) -> Path:
-    """A run of two updates in one go."""
-    run("memoryvla", runs / request.param, *SMALL, *WORDS[request.param], "train.steps=2")
-    return runs / request.param
-
-
-def test_it_trains_by_the_command_and_resumes_where_it_stopped(trained: Path) -> None:
-    parts, words = (
-        trained.parent / f"{trained.name}_parts",
-        [*SMALL, *WORDS[trained.name], "train.val_samples=0", "train.open_loop_chunks=0"],
-    )
-    run("memoryvla", parts, *words, "train.steps=1")
-    resumed = run("memoryvla", trained.parent / "unused", *words, "train.steps=2", f"resume={parts}")
-    assert losses(parts) == losses(trained) and len(losses(parts)) == 2
-    after = load_tensors(resumed)
-    for tensor, value in load_tensors(trained / "checkpoints" / "step_000002").items():
-        assert torch.equal(value, after[tensor]), tensor
-
-
-def test_it_is_evaluated_served_probed_and_inspected(trained: Path, tmp_path: Path) -> None:
-    policy = Policy.from_pretrained(trained).eval()
-    envs = InlineEnvs(base=make_scripted_env, robot=policy.embodiment, max_steps=20)
-    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=20)
-    assert record.outcome in ("success", "fail", "timeout") and record.steps > 0
-
-    frames, states = moving_frames(5), np.full((5, 8), 0.04, np.float32)
-    episode = policy.start_episode("pick up the cube", seed=42)
-    episode.observe({"front": frames, "wrist": frames}, states, np.arange(5) < 4)
-    expected = policy.act(episode, 2)
-    with Served(policy) as served, served.client() as client:
-        reply = client.infer(challenge(frames, frames, states, first=True))["actions"]
-    np.testing.assert_allclose(reply, expected[: policy.embodiment.action.execute], rtol=1e-4, atol=1e-5)
-
-    recordings = all_recordings(open_sources(["sample"], policy.embodiment))
-    settings = OfflineSettings(draws=1, moments=1, flow_steps=2)
-    arms = read_arms(["nodemo", "delay:64"])
-    results = probe_offline(policy, arms, recordings[:1], recordings, tmp_path / "lines.jsonl", settings)
-    assert all(np.isfinite(line.change) for line in results if isinstance(line, MomentLine))
-
-    console = Console(record=True, width=200, file=io.StringIO())
-    show_checkpoint(trained, console)
-    assert str(policy.config["name"]) in console.export_text()
-
-
 def test_what_cannot_stand_there_is_refused_in_words() -> None:
     with pytest.raises(UserError, match="the tower of the backbone 'memoryvla' sees one image at a time"):
         build_policy("memoryvla", memory="spacetime")
@@ -238,20 +163,6 @@ def test_what_cannot_stand_there_is_refused_in_words() -> None:
         build_policy("memoryvla", memory="framesamp", **{"memory.grid": 3, "memory.budget": 9})
     with pytest.raises(UserError, match="freeze_vision"):
         check_frozen(recalling(), freeze_vision=False)
-
-
-def test_the_memory_learns_in_full_beside_adapters(policy: MemoryVlaPolicy) -> None:
-    counts = apply_finetuning(policy, "expert_only")
-    of_memory = sum(p.numel() for n, p in policy.named_parameters() if policy.finetune_spec.component_of(n) == "memory")
-    assert counts["memory"] == of_memory > sum(p.numel() for p in policy.require_memory().parameters())
-    assert counts["vision"] == counts["vlm"] == 0
-    apply_finetuning(policy, freeze_vision=False)
-
-
-def test_a_cache_is_of_the_images_that_its_tower_saw(policy: MemoryVlaPolicy) -> None:
-    baseline = recalling(processor={"jpeg": False})
-    assert torch.equal(policy.vlm.vision.dino.cls_token, baseline.vlm.vision.dino.cls_token)
-    assert policy.vision_fingerprint() == recalling().vision_fingerprint() != baseline.vision_fingerprint()
 
 
 @pytest.mark.parametrize(("model", "words"), [("memoryvla", {}), ("memoryvla", {"memory": "ttt"}), ("openvla_oft", {})])

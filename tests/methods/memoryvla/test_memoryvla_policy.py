@@ -1,21 +1,15 @@
-"""MemoryVLA as a policy: groups of one episode, banks in the episode, training by the command."""
-
-from dataclasses import replace
-from pathlib import Path
+"""MemoryVLA as a policy: groups of one episode, banks in the episode."""
 
 import numpy as np
 import pytest
 import torch
 
 from helpers.memoryvla_golden import reached
-from helpers.prior_vla_runs import losses, run
 from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import GroupDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.methods.memoryvla.processor import GroupBatch
-from mme_vla.policy.base import Policy
-from mme_vla.policy.tensor_files import load_tensors
 
 SMALL = {"vision": {"image_size": 28}}
 
@@ -90,19 +84,6 @@ def test_images_are_changed_by_their_draws_alone_whatever_stands_beside_them() -
     apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
     assert abs(apart - first) < abs(other - first) / 20
     assert policy.eval().augmentation_params(2, torch.Generator()) == {}
-
-
-@torch.no_grad()
-def test_groups_of_a_batch_and_their_padding_do_not_meet() -> None:
-    policy = tiny()
-    data, collate = groups(policy), policy.require_processor().collate
-    long, short = data[0], data.observation(0)
-    short = {**short, "moments": short["moments"][-1:], "times": short["times"][-1:]}
-    noise = {"noise": torch.randn(2, policy.horizon, policy.action_dim, generator=torch.Generator().manual_seed(0))}
-    together = policy.sample_actions(collate([long, short]), noise)
-    for i, item in enumerate((long, short)):
-        alone = policy.sample_actions(collate([item]), {"noise": noise["noise"][i : i + 1]})
-        torch.testing.assert_close(together[i : i + 1], alone, rtol=1e-4, atol=1e-5)
 
 
 @torch.no_grad()
@@ -200,37 +181,8 @@ def test_a_prompt_ends_in_the_opening_piece_and_the_end_of_the_text() -> None:
         assert ids[mask][-2:].tolist() == [processor.tokenizer.piece("▁"), processor.tokenizer.end]
 
 
-def test_it_counts_on_meta_without_anything_to_show() -> None:
-    policy = build_policy("memoryvla", device="meta")
-    batch = policy.full_batch("meta")
-    assert policy(batch)[0].is_meta and policy.sample_actions(batch).shape == (1, 16, 8)
-
-
 def test_what_it_has_no_place_for_is_refused_in_words() -> None:
     with pytest.raises(UserError, match="group_size=1: MemoryVLA's banks"):
         build_policy("memoryvla", processor={"group_size": 1})
     with pytest.raises(UserError, match="group_size must be a positive"):
         build_policy("memoryvla", processor={"group_size": 0})
-
-
-def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:
-    policy = tiny()
-    policy.save_pretrained(tmp_path)
-    again = Policy.from_pretrained(tmp_path)
-    assert isinstance(again, MemoryVlaPolicy) and again.require_processor().samples.group_size == 4
-    batch, noise = batch_of(policy), {"noise": torch.randn(2, policy.horizon, policy.action_dim)}
-    assert torch.equal(policy.sample_actions(batch, noise), again.sample_actions(batch, noise))
-    with pytest.raises(ValueError, match="actions"):
-        policy(replace(batch, actions=None))
-
-
-def test_it_trains_by_the_command_and_resumes_where_it_stopped(tmp_path: Path) -> None:
-    small = ["backbone.vision.image_size=28", "processor.group_size=2", "train.batch_size=2", "backbone.head.depth=1"]
-    whole = run("memoryvla", tmp_path / "whole", *small, "train.steps=2", "train.open_loop_chunks=1")
-    parts, compared = tmp_path / "parts", [*small, "train.val_samples=0"]
-    run("memoryvla", parts, *compared, "train.steps=1")
-    resumed = run("memoryvla", tmp_path / "unused", *compared, "train.steps=2", f"resume={parts}")
-    assert losses(parts) == losses(tmp_path / "whole") and len(losses(parts)) == 2
-    after = load_tensors(resumed)
-    for name, tensor in load_tensors(whole).items():
-        assert torch.equal(tensor, after[name]), name

@@ -12,7 +12,7 @@ from torch import Tensor
 from helpers.baselines import baselines_folder, rule_weight
 from helpers.golden import error
 from helpers.openvla_golden import batch, case, fused, golden_name, policy
-from mme_vla.backbone.attention import additive_mask
+from mme_vla.backbone.layers import additive_mask
 from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.methods.openvla_oft.model import OpenVlaBackbone, TokenSequence, absolute_error
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles

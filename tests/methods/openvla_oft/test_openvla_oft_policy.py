@@ -1,7 +1,6 @@
 """OpenVLA-OFT as a policy: its five compositions learn and act, and refuse what they cannot do."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from torch import Tensor
 from mme_vla import UserError, build_policy
 from mme_vla.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.methods.openvla_oft.processor import OpenVlaProcessor
-from mme_vla.policy.base import Policy
 from mme_vla.testing import check_backbone
 from mme_vla.testing.small import random_batch, unit_stats
 from mme_vla.types import Batch
@@ -90,24 +88,6 @@ def test_prompts_ask_in_lower_case_name_the_subgoal_and_end_in_the_opening_piece
         assert int(ids[mask][-1]) == processor.tokenizer.piece("▁")
 
 
-def test_a_prompt_that_is_cut_still_ends_in_the_opening_piece() -> None:
-    processor = build_policy("openvla_oft", processor={"prompt_length": 12}).require_processor()
-    assert isinstance(processor, OpenVlaProcessor)
-    with pytest.warns(UserWarning, match="loses its end"):
-        ids, mask = processor.prompt("press the red button and then the blue one")
-    assert mask.all() and int(ids[-1]) == processor.tokenizer.piece("▁")
-
-
-def test_training_uses_random_crops_and_acting_the_middle() -> None:
-    policy = tiny()
-    images = torch.randint(0, 256, (2, 2, 3, 32, 32), dtype=torch.uint8)
-    batch = replace(batch_for(policy), images=images.repeat(1, 1, 1, 4, 4)[..., :112, :112])
-    assert torch.equal(policy.prepare_images(batch).images, policy.prepare_images(batch).images)
-    draws = policy.train().augmentation_params(4, torch.Generator().manual_seed(0))["changes"]
-    first = policy.prepare_images(batch, draws[:2]).images
-    assert first.shape == batch.images.shape and not torch.equal(first, policy.prepare_images(batch, draws[2:]).images)
-
-
 def test_what_this_backbone_cannot_do_is_refused_in_words() -> None:
     with pytest.raises(UserError, match="every token sees every other"):
         build_policy("openvla_oft_framesamp_context", integration={"prompt_sees_memory": False})
@@ -115,12 +95,3 @@ def test_what_this_backbone_cannot_do_is_refused_in_words() -> None:
         build_policy("framesamp_modul", backbone="openvla_tiny", embodiment="robomme_joint_absolute")
     with pytest.raises(UserError, match="as wide as the robot's"):
         build_policy("openvla_oft", backbone={"action_dim": 32})
-
-
-def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:
-    policy = tiny("openvla_oft_tokendrop_context")
-    policy.save_pretrained(tmp_path)
-    again = Policy.from_pretrained(tmp_path)
-    assert isinstance(again, OpenVlaPolicy) and isinstance(again.processor, OpenVlaProcessor)
-    batch = batch_for(policy)
-    assert torch.equal(policy.sample_actions(batch), again.sample_actions(batch))

@@ -1,41 +1,20 @@
-"""OpenVLA-OFT through the training command: it learns, resumes to the bit, and the data are those of its recipe."""
+"""OpenVLA-OFT in training: it learns through a memory, and the data are those of its recipe."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.prior_vla_runs import losses, run
-from mme_vla.config.composition import compose
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.methods.openvla_oft.policy import OpenVlaPolicy
-from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import random_batch
 
 TOWER = {"width": 8, "depth": 2, "mlp_dim": 16, "num_heads": 1}
-SMALL = ["train.batch_size=2", "backbone.vision.image_size=32", "backbone.vision.patch_size=2"]
-
-
-@pytest.mark.parametrize("extra", [(), ("finetune=oft", "finetune.rank=2")], ids=["full", "adapters"])
-def test_it_trains_by_the_command_and_resumes_where_it_stopped(extra: tuple[str, ...], tmp_path: Path) -> None:
-    whole = run("openvla_oft", tmp_path / "whole", *SMALL, *extra, "train.steps=2", "train.open_loop_chunks=1")
-    parts, compared = tmp_path / "parts", [*SMALL, *extra, "train.val_samples=0"]
-    run("openvla_oft", parts, *compared, "train.steps=1")
-    resumed = run("openvla_oft", tmp_path / "unused", *compared, "train.steps=2", f"resume={parts}")
-    assert losses(parts) == losses(tmp_path / "whole") and len(losses(parts)) == 2
-    after = load_tensors(resumed)
-    for name, tensor in load_tensors(whole).items():
-        assert torch.equal(tensor, after[name]), name
-    policy = Policy.from_pretrained(resumed)
-    assert isinstance(policy, OpenVlaPolicy)
-    assert bool(policy.config.get("adapters")) == bool(extra)
 
 
 def test_with_a_memory_it_answers_by_what_it_remembers() -> None:
@@ -100,8 +79,3 @@ def test_the_frozen_base_is_grasped_in_bfloat16_and_what_learns_in_float32() -> 
     learned = [p.grad for p in policy.parameters() if p.grad is not None]
     assert all(grad.dtype == torch.float32 and torch.isfinite(grad).all() for grad in learned)
     assert any(grad.abs().sum() > 0 for grad in learned)
-
-
-def test_the_recipe_holds_the_base_so() -> None:
-    cfg = compose("train", ["experiment=openvla_oft"])
-    assert (cfg.finetune.mode, cfg.finetune.frozen_dtype, cfg.policy.compute_dtype) == ("lora", "bfloat16", "bfloat16")

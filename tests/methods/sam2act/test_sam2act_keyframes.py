@@ -101,14 +101,6 @@ def test_a_conversion_without_keyframes_is_another_plan_and_has_none(folder: Pat
         EpisodeKeyframes(file_of(tmp_path / "out", 0))
 
 
-def test_damaged_keyframes_are_named(folder: Path, tmp_path: Path) -> None:
-    content = file_of(folder / "out", 0).read_bytes()
-    for damaged in (content[: len(content) // 2], b"nothing of the kind"):
-        (tmp_path / "kept.npz").write_bytes(damaged)
-        with pytest.raises(UserError, match="is damaged"):
-            EpisodeKeyframes(tmp_path / "kept.npz").motions  # noqa: B018
-
-
 def source_of(folder: Path) -> EpisodeSource:
     return EpisodeSource(folder / "out")
 
@@ -196,11 +188,6 @@ def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_sh
     assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(1 / 3, abs=0.03)
 
 
-def test_chains_that_are_too_short_for_any_sample_are_reported(folder: Path) -> None:
-    with pytest.raises(UserError, match="No chain of keyframes in the data has 100 of them; the longest has"):
-        KeyframeDataset([source_of(folder)], Plain(), 100)
-
-
 def test_depth_becomes_a_table_at_its_height(folder: Path) -> None:
     shots = EpisodeKeyframes(file_of(folder / "out", 0)).shots([0])[0]
     points, colours = cloud_of(shots, 128)
@@ -208,16 +195,6 @@ def test_depth_becomes_a_table_at_its_height(folder: Path) -> None:
     assert np.allclose(points[:, 2], 0.2, atol=1e-6)
     # 0.8 m away an image of 90° / 2 of slope ½ is 0.4 m wide.
     assert np.allclose([points[:, 0].min(), points[:, 0].max()], [-0.2, 0.2], atol=0.01)
-
-
-def test_colours_are_averaged_and_intrinsics_follow() -> None:
-    colours = np.zeros((4, 4, 3), np.uint8)
-    colours[::2] = 200
-    shot = Shot(colours, np.arange(16.0).reshape(4, 4), np.array([[8.0, 0, 2], [0, 8, 2], [0, 0, 1]]), np.eye(4)[:3])
-    small = shot.shrunk(2)
-    assert (small.colours == 100).all()
-    assert small.depth.tolist() == [[2.5, 4.5], [10.5, 12.5]]
-    assert small.intrinsic.tolist() == [[4, 0, 1], [0, 4, 1], [0, 0, 1]]
 
 
 def test_a_cloud_outside_of_the_cube_shows_nothing() -> None:

@@ -1,17 +1,13 @@
-"""SAM2Act+ as a policy: what it learns, what an episode remembers, training by command, a rollout of waypoints."""
+"""SAM2Act+ as a policy: what it learns, and what an episode remembers."""
 
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from helpers.h5_files import write_file
-from mme_vla.cli.train import train
-from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
@@ -19,11 +15,8 @@ from mme_vla.data.keyframes import KeyframeDataset
 from mme_vla.errors import UserError
 from mme_vla.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.methods.sam2act.processor import KeyframeBatch
-from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.tensor_files import load_tensors
-from mme_vla.training.logging import read_metrics
 
 DOWN = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
 
@@ -122,15 +115,6 @@ def test_an_episode_remembers_keyframes_once_they_lie_behind(policy: SAM2ActPoli
     assert episode.remembered.maps[-1] is not n_entries.maps[-1]
 
 
-def test_pieces_of_frames_are_as_good_as_all_of_them(policy: SAM2ActPolicy) -> None:
-    straight, pieces = policy.start_episode("pick the cube"), policy.start_episode("pick the cube")
-    frames, demo = views(9), np.arange(9) < 7
-    straight.observe(frames, states(9), demo)
-    for part in (slice(0, 4), slice(4, 7), slice(7, 9)):
-        pieces.observe({name: value[part] for name, value in frames.items()}, states(9)[part], demo[part])
-    assert np.array_equal(policy.act(straight), policy.act(pieces))
-
-
 def test_what_is_remembered_reaches_the_waypoints_scores(policy: SAM2ActPolicy) -> None:
     frames = views(2)
     fresh, experienced = policy.start_episode("pick the cube"), policy.start_episode("pick the cube")
@@ -160,57 +144,8 @@ def test_missing_depth_or_poses_are_named(policy: SAM2ActPolicy, lacking: str) -
         policy.start_episode("pick").observe(frames, states(1))
 
 
-def test_misshapen_depth_is_named(policy: SAM2ActPolicy) -> None:
-    frames = views(1)
-    frames["front_depth"] = frames["front_depth"][:, :10]
-    with pytest.raises(UserError, match=r"front_depth must be \[1, 64, 64, 1\]"):
-        policy.start_episode("pick").observe(frames, states(1))
-
-
-def test_a_saved_policy_acts_as_before(policy: SAM2ActPolicy, tmp_path: Path) -> None:
-    policy.save_pretrained(tmp_path)
-    loaded = Policy.from_pretrained(tmp_path)
-    assert isinstance(loaded, SAM2ActPolicy)
-    answers = []
-    for each in (policy, loaded):
-        episode = each.start_episode("pick the cube")
-        episode.observe(views(2), states(2))
-        answers.append(each.act(episode))
-    assert np.array_equal(*answers)
-
-
 def test_robots_without_depth_or_with_other_actions_are_refused() -> None:
     with pytest.raises(UserError, match="needs depth of every camera"):
         built(embodiment="robomme_waypoint")
     with pytest.raises(UserError, match="one planned motion of 7 numbers"):
         built(embodiment={"action": {"horizon": 2}})
-
-
-def test_it_counts_on_meta_without_anything_to_draw() -> None:
-    policy = build_policy("sam2act_plus", device="meta")
-    batch = policy.full_batch("meta")
-    assert policy(batch)[0].is_meta
-    assert policy.sample_actions(batch).shape == (1, 1, 7)
-
-
-def run(data: Path, folder: Path, *words: str, resume: str = "null") -> Path:
-    """Train as the command does; the last checkpoint."""
-    small = ["model=sam2act_plus", f"data.sources=[{data}]", "data.val_episodes=[]", "logger=none", "train.workers=0",
-             "train.device=cpu", "train.batch_size=2", "train.warmup=1", "train.log_every=1",
-             f"resume={resume}"]  # fmt: skip
-    cfg = compose("train", [*small, *words])
-    config: Any = OmegaConf.to_container(cfg, resolve=True)
-    return train(cfg, config, folder, begun=time.perf_counter())
-
-
-@pytest.mark.parametrize("optimizer", ["adamw", "lamb"])
-def test_the_command_trains_it_and_resumes_to_the_last_bit(data: Path, tmp_path: Path, optimizer: str) -> None:
-    setting = f"train.optimizer={optimizer}"
-    straight = run(data, tmp_path / "whole", setting, "train.steps=2")
-    run(data, tmp_path / "parts", setting, "train.steps=1")
-    parts = run(data, tmp_path / "new", setting, "train.steps=2", resume=str(tmp_path / "parts"))
-    assert parts.parent.parent == tmp_path / "parts"
-    assert [line["step"] for line in read_metrics(tmp_path / "whole") if "train/loss" in line] == [1, 2]
-    ended = [load_tensors(folder) for folder in (straight, parts)]
-    assert all(torch.equal(value, ended[1][name]) for name, value in ended[0].items())
-    assert isinstance(Policy.from_pretrained(straight), SAM2ActPolicy)
