@@ -6,13 +6,13 @@
 import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Injection
-from mme_vla.errors import check_sizes
+from mme_vla.errors import check_sizes, require
 from mme_vla.registry import HEADS
 from mme_vla.types import Batch, Noise, Overlap
 
@@ -74,6 +74,14 @@ def normal_log_density(x: Tensor, deviation: float) -> Tensor:
     return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (math.log(deviation) + 0.5 * math.log(2 * math.pi))
 
 
+def _check_increments(increments: Tensor, steps: int, overlap: Overlap | None) -> None:
+    require(
+        increments.shape[1] == steps,
+        f"flow_steps={steps}: backbone.head.deviation adds noise in {increments.shape[1]} steps; set backbone.head.steps.",
+    )
+    require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
+
+
 Predict = Callable[[Tensor, Tensor], Tensor]
 """`predict(x_t, time)`: the network's output [b, h, a] at noisy chunks [b, h, a] and flow times [b]."""
 PredictAt = Callable[[Tensor, int], Tensor]
@@ -90,10 +98,24 @@ class FlowHead:
         horizon, action_dim: of a chunk [h, a].
         time_distribution: `beta` or `uniform`, see `sample_time`.
         steps: Euler steps unless the caller says otherwise.
+        deviation: σ of Gaussian noise in each Euler step while sampling, in units of normalised actions (policy
+            gradients, `mme_vla.policy.log_prob`); 0 samples without it.
     """
 
-    def __init__(self, horizon: int, action_dim: int, time_distribution: str = "beta", steps: int = EULER_STEPS):
+    supports_rtc: ClassVar[bool] = True
+    """Whether real-time chunking can guide the sampler."""
+
+    def __init__(
+        self,
+        horizon: int,
+        action_dim: int,
+        time_distribution: str = "beta",
+        steps: int = EULER_STEPS,
+        deviation: float = 0.0,
+    ):
         check_sizes("backbone.head", steps=steps)
+        require(deviation >= 0, f"backbone.head.deviation={deviation} must not be negative.")
+        self.deviation = deviation
         self.horizon, self.action_dim = horizon, action_dim
         self.time_distribution, self.steps = time_distribution, steps
 
@@ -103,8 +125,10 @@ class FlowHead:
         return {"noise": noise, "time": sample_time(count, self.time_distribution, noise.device, generator)}
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """The starting `noise` [h, a], on the CPU."""
-        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+        """The starting `noise` [h, a], on the CPU; with `deviation`, `increments` [steps, h, a] of the Euler steps too."""
+        shape = self.horizon, self.action_dim
+        noise = {"noise": torch.randn(*shape, generator=generator)}
+        return noise | ({"increments": torch.randn(self.steps, *shape, generator=generator)} if self.deviation else {})
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
         """The loss [b, h] of chunks [b, h, a]: squared error of the velocity."""
@@ -119,8 +143,21 @@ class FlowHead:
         """The velocity [b, h, a] at each of so many Euler steps from the network's output."""
         return predict
 
-    def sample(self, predict: PredictAt, noise: Tensor, steps: int, overlap: Overlap | None = None) -> Tensor:
-        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed."""
+    def sample(
+        self,
+        predict: PredictAt,
+        noise: Tensor,
+        steps: int,
+        overlap: Overlap | None = None,
+        increments: Tensor | None = None,
+    ) -> Tensor:
+        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed.
+
+        increments: [b, steps, h, a], standard normal; `deviation` times them is added in each step.
+        """
+        if increments is not None:
+            _check_increments(increments, steps, overlap)
+            return self.sample_path(predict, noise, increments, self.deviation)[:, -1]
         velocity = self.velocity(predict, steps, noise.device)
         if overlap is not None:
             from mme_vla.speed.rtc import rtc_guidance
@@ -187,6 +224,13 @@ class HasFlowHead:
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
         """The network's output at noisy chunks [b, h, a] and flow times [b], with gradient, for one observation."""
         raise NotImplementedError
+
+    def sample_chunk(
+        self, predict: PredictAt, noise: Mapping[str, Tensor], steps: int, overlap: Overlap | None
+    ) -> Tensor:
+        """The chunk [b, h, a] that the head samples from noise as `sampling_noise` makes it."""
+        more = {"increments": noise["increments"]} if "increments" in noise else {}
+        return self.head.sample(predict, noise["noise"], steps, overlap, **more)
 
     def make_head(self, config: Any) -> None:
         """Build the head that `config.head` names, for the sizes and the time distribution of `config`."""

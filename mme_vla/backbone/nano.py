@@ -294,7 +294,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         def clean(x: Tensor, index: int) -> Tensor:
             return self.denoise(context, x, times[index].expand(len(x)), 1)
 
-        return self.head.sample(clean, start, steps, batch.overlap)
+        return self.sample_chunk(clean, noise, steps, batch.overlap)
 
     def predictor(self, batch: Batch, injection: Injection) -> Predict:
         context = self.read_context(batch, injection)

@@ -178,7 +178,7 @@ class Pi05Backbone(
         def velocity(x_t: Tensor, i: int) -> Tensor:
             return self.denoise(x_t, conditions.at(i, rows), layout, past, injection)
 
-        return self.head.sample(velocity, x, steps, batch.overlap)
+        return self.sample_chunk(velocity, noise, steps, batch.overlap)
 
     def prefill(self, injection: Injection) -> KVCache:
         """Keys and values of the prefix, which all steps of a chunk share."""
