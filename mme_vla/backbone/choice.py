@@ -40,7 +40,7 @@ class ChoiceHead(FlowHead):
         super().__init__(horizon, action_dim, time_distribution, steps=1, deviation=deviation)
         require(
             len(choice) and all(0 <= place < action_dim for place in choice),
-            f"backbone.head.choice={list(choice)} must list the columns of the letters, from 0 to {action_dim - 1}. Set "
+            f"backbone.head.choice={list(choice)} must list the columns of the letters, 0 to {action_dim - 1}. Set "
             "embodiment=robomme_choice and head.choice=${embodiment.action.choice}.",
         )
         require(temperature >= 0, f"backbone.head.temperature={temperature} must not be negative.")
@@ -95,9 +95,7 @@ class ChoiceHead(FlowHead):
         Returns:
             Log-probability of the letter, plus the log-density of the other numbers if `deviation` is positive.
         """
-        require(
-            self.temperature > 0, "backbone.head.temperature=0 has no log-probability: set a positive temperature."
-        )
+        require(self.temperature > 0, "backbone.head.temperature=0 has no log-probability: set a positive temperature.")
         output = predict(torch.zeros_like(chunk), 0).float()
         logits, scores = output[..., self.choice] / self.temperature, chunk[..., self.choice]
         if options is not None:

@@ -77,7 +77,7 @@ def normal_log_density(x: Tensor, deviation: float) -> Tensor:
 def _check_increments(increments: Tensor, steps: int, overlap: Overlap | None) -> None:
     require(
         increments.shape[1] == steps,
-        f"flow_steps={steps}: backbone.head.deviation adds noise in {increments.shape[1]} steps; set backbone.head.steps.",
+        f"flow_steps={steps}: backbone.head.deviation has noise for {increments.shape[1]}; set backbone.head.steps.",
     )
     require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
 
@@ -125,7 +125,7 @@ class FlowHead:
         return {"noise": noise, "time": sample_time(count, self.time_distribution, noise.device, generator)}
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """The starting `noise` [h, a], on the CPU; with `deviation`, `increments` [steps, h, a] of the Euler steps too."""
+        """The starting `noise` [h, a], on the CPU; with `deviation` also `increments` [steps, h, a]."""
         shape = self.horizon, self.action_dim
         noise = {"noise": torch.randn(*shape, generator=generator)}
         return noise | ({"increments": torch.randn(self.steps, *shape, generator=generator)} if self.deviation else {})

@@ -125,7 +125,12 @@ class Policy(nn.Module):
                 f"{name} does not support real-time chunking, which needs a flow policy such as π0.5. Leave out "
                 "set_action_prefix()."
             )
-        return choose_actions(self, episodes, lambda batch, noise: self.predict_chunk(batch, episodes, noise, steps)).actions
+        waiting = episodes
+
+        def predict(batch: Any, noise: Mapping[str, Tensor]) -> Tensor:
+            return self.predict_chunk(batch, waiting, noise, steps)
+
+        return choose_actions(self, waiting, predict).actions
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """The current observations of episodes, as a batch of the processor's kind on the policy's device."""

@@ -65,6 +65,24 @@ def test_without_noise_the_path_ends_in_the_plain_chunk(backbone: str) -> None:
         sample_path(policy, batch, -1)
 
 
+def test_a_head_with_deviation_samples_the_path_of_its_noise() -> None:
+    steps, generator = 4, torch.Generator().manual_seed(0)
+    head = FlowHead(horizon=2, action_dim=3, steps=steps, deviation=0.3)
+    noise = {name: value[None] for name, value in head.sampling_noise(generator).items()}
+    assert noise["increments"].shape == (1, steps, 2, 3)
+
+    def linear(x: torch.Tensor, index: int) -> torch.Tensor:
+        return 0.7 * x
+
+    path = head.sample_path(linear, noise["noise"], noise["increments"], 0.3)
+    assert torch.equal(head.sample(linear, noise["noise"], steps, increments=noise["increments"]), path[:, -1])
+    plain = head.sample(linear, noise["noise"], steps)
+    assert torch.equal(head.sample_path(linear, noise["noise"], noise["increments"], 0.0)[:, -1], plain)
+    assert set(FlowHead(horizon=2, action_dim=3).sampling_noise(generator)) == {"noise"}
+    with pytest.raises(UserError, match="flow_steps=5"):
+        head.sample(linear, noise["noise"], 5, increments=noise["increments"])
+
+
 def _policy(backbone: str) -> MMEPolicy:
     if backbone == "nano":
         return small_policy("framesamp_modul", backbone="nano")
