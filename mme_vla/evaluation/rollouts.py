@@ -307,7 +307,8 @@ class _Collector(Rollout):
         return EpisodeSpec(job.task, job.split, job.episode, 0, "")  # of any environment; no record is written
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
-        decisions, records = self._decisions.pop(running, []), []
+        records: list[EpisodeRecord] = []
+        decisions = self._decisions.pop(running, [])
         self._oracle.pop(running, None)
         self.record = records.append
         tries = self._tries[running.job]

@@ -1,5 +1,6 @@
 """Rollouts as data: rows, rewards, log-probabilities and the oracle's actions, on an environment of one decision."""
 
+import re
 import runpy
 from typing import Any
 
@@ -123,9 +124,10 @@ def test_an_example_learns_the_right_choices(example: str, monkeypatch: pytest.M
     assert first < 0.7 and last >= 0.9
 
 
-@pytest.mark.slow
-def test_dagger_learns_a_task_from_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    pytest.importorskip("mani_skill")
-    rates = runpy.run_path(str(EXAMPLES / "dagger.py"))["main"](output=tmp_path / "policy")
-    assert rates[0] == 1.0 and rates[-1] >= 11 / 12
-    assert MMEPolicy.from_pretrained(tmp_path / "policy").require_processor().stats is not None
+def test_the_code_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    page = (REPOSITORY / "docs" / "extend" / "trajectories.md").read_text()
+    space: dict[str, Any] = {"__name__": "page"}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "docs/extend/trajectories.md", "exec"), space)
+    assert all(t.rewards is not None for t in space["trajectories"])
