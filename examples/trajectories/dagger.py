@@ -34,8 +34,8 @@ def main(rounds: int = 3, updates: int = 120, output: str = "outputs/dagger") ->
     policy = build_policy(
         "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", seed=0,
         memory={"budget": 4, "grid": 1, "every": 8}, policy={"augment": False},
+        **{"backbone.head.temperature": 0},  # the best option, without noise
     )  # fmt: skip
-    policy.backbone.head.temperature = 0  # the best option, without noise
     policy.backbone.vision.requires_grad_(False)
     policy.require_processor().stats = NormStats.unit(8, 10)
     optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], 1e-3)
