@@ -4,7 +4,7 @@ import torch
 
 from mme_vla import MMEPolicy, build_policy, make_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollouts import join, rollouts
+from mme_vla.evaluation.rollouts import join, rollouts, with_view_tokens
 from mme_vla.processing.normalise import NormStats
 from mme_vla.types import Batch
 
@@ -29,7 +29,7 @@ def learn(policy: MMEPolicy, optimizer: torch.optim.Optimizer, rows: Batch, upda
     return loss.item()
 
 
-def main(rounds: int = 3, updates: int = 120, output: str = "outputs/dagger") -> list[float]:
+def main(rounds: int = 4, updates: int = 120, output: str = "outputs/dagger") -> list[float]:
     """The success rate of each round on scenes that are new to the policy; in the first the oracle acts."""
     policy = build_policy(
         "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", seed=0,
@@ -48,7 +48,7 @@ def main(rounds: int = 3, updates: int = 120, output: str = "outputs/dagger") ->
         rates.append(sum(t.success for t in trajectories) / SCENES)
         data += [t.oracle for t in trajectories if t.oracle is not None]
         if step < rounds - 1:
-            loss = learn(policy, optimizer, join(data), updates)
+            loss = learn(policy, optimizer, with_view_tokens(policy, join(data)), updates)
             print(f"round {step}: success {rates[-1]:.2f}, {sum(len(b.prompt) for b in data)} rows, loss {loss:.3f}")
     print(f"round {rounds - 1}: success {rates[-1]:.2f}")
     policy.save_pretrained(output)

@@ -5,7 +5,7 @@ from two_choices import make_two_choices
 
 from mme_vla import MMEPolicy, build_policy
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.rollouts import Trajectory, join, rollouts
+from mme_vla.evaluation.rollouts import Trajectory, join, rollouts, with_view_tokens
 from mme_vla.policy.log_prob import log_prob
 from mme_vla.processing.normalise import NormStats
 
@@ -29,7 +29,8 @@ def update(policy: MMEPolicy, optimizer: torch.optim.Optimizer, groups: list[lis
     advantages = (returns - returns.mean(0)) / (returns.std(0) + 1e-6)  # in the group of an episode
     trajectories = [t for group in groups for t in group]
     advantages = advantages.flatten().repeat_interleave(torch.tensor([len(t.chunks) for t in trajectories]))
-    rows, chunks = join([t.observations for t in trajectories]), torch.cat([t.chunks for t in trajectories])
+    rows = with_view_tokens(policy, join([t.observations for t in trajectories]))
+    chunks = torch.cat([t.chunks for t in trajectories])
     before = torch.cat([t.log_probs for t in trajectories])
     for _ in range(epochs):
         ratio = (log_prob(policy, rows, chunks) - before).exp()

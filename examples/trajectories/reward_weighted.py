@@ -5,7 +5,7 @@ from grpo import JOBS, tower_free
 from two_choices import make_two_choices
 
 from mme_vla import MMEPolicy, build_policy
-from mme_vla.evaluation.rollouts import Trajectory, join, rollouts
+from mme_vla.evaluation.rollouts import Trajectory, join, rollouts, with_view_tokens
 from mme_vla.policy.log_prob import log_prob
 from mme_vla.processing.normalise import NormStats
 
@@ -16,7 +16,8 @@ def update(policy: MMEPolicy, optimizer: torch.optim.Optimizer, trajectories: li
     returns = torch.tensor([t.total_reward for t in trajectories])
     counts = torch.tensor([len(t.chunks) for t in trajectories])
     weights = ((returns - returns.max()) / TEMPERATURE).exp().repeat_interleave(counts)
-    rows, chunks = join([t.observations for t in trajectories]), torch.cat([t.chunks for t in trajectories])
+    rows = with_view_tokens(policy, join([t.observations for t in trajectories]))
+    chunks = torch.cat([t.chunks for t in trajectories])
     for _ in range(epochs):
         loss = -(weights * log_prob(policy, rows, chunks)).sum() / weights.sum()
         optimizer.zero_grad()

@@ -18,8 +18,9 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job, Reply, VecEnv
 from mme_vla.errors import UserError, check_known, require
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.local import LocalEnvs
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import stack_history
@@ -151,7 +152,17 @@ def join(batches: Sequence[Batch]) -> Batch:
             values = [functional.pad(value, (0, length - value.shape[1])) for value in values]
         return torch.cat(values)
 
-    names = ("images", "image_mask", "prompt", "prompt_mask", "actions", "action_mask", "state", "options")
+    names = (
+        "images",
+        "image_mask",
+        "prompt",
+        "prompt_mask",
+        "actions",
+        "action_mask",
+        "state",
+        "options",
+        "view_tokens",
+    )
     past = [batch.past for batch in batches if batch.past is not None]
     joined_past = (
         replace(past[0], images=torch.cat([p.images for p in past]), mask=torch.cat([p.mask for p in past]))
@@ -162,56 +173,19 @@ def join(batches: Sequence[Batch]) -> Batch:
     return Batch(**{name: cat(name) for name in names}, history=history, past=joined_past)
 
 
+@torch.no_grad()
+def with_view_tokens(policy: MMEPolicy, batch: Batch, size: int = 32) -> Batch:
+    """The rows with the vision tower's tokens, so that a tower that does not learn runs once for each row."""
+    tokens = []
+    with policy.autocast():
+        for start in range(0, len(batch.prompt), size):
+            images = policy.prepare_images(batch.rows(slice(start, start + size)).to(policy.device)).images
+            tokens.append(policy.backbone.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2]))
+    return replace(batch, view_tokens=torch.cat(tokens))
+
+
 def _unbatched(history: HistoryTokens) -> list[HistoryTokens]:
     return [history._map(lambda x, i=i: x[i]) for i in range(len(history.mask))]
-
-
-class LocalEnvs:
-    """One environment in this process, in place of a `VecEnv`."""
-
-    workers = 1
-
-    def __init__(self, options: Mapping[str, Any]) -> None:
-        self._options, self._job = dict(options), Job("", "", 0)
-        self._env: ChunkEnv | None = None
-        self._replies: list[Reply] = []
-
-    @property
-    def busy(self) -> bool:
-        """Whether a reply is waiting."""
-        return bool(self._replies)
-
-    def start(self, worker: int, job: Job, **how: Any) -> None:
-        """Begin an episode."""
-        self._close()
-        self._job = job
-        try:
-            self._env = make_rollout_env(job.task, job.split, job.episode, **self._options)
-            self._add(Reply.of_outcome(worker, job, True, self._env.reset(**how)))
-        except UserError:
-            raise
-        except Exception as error:  # a scene that cannot be built ends its episode, not the others
-            self._add(Reply.of_failure(worker, job, True, type(error).__name__, str(error)))
-
-    def send(self, worker: int, action: Any) -> None:
-        """Execute a chunk."""
-        assert self._env is not None
-        self._add(Reply.of_outcome(worker, self._job, False, self._env.step(action)))
-
-    def recv(self, timeout: float | None = None) -> list[Reply]:
-        """The reply that is waiting."""
-        replies, self._replies = self._replies, []
-        return replies
-
-    def _add(self, reply: Reply) -> None:
-        if reply.done:
-            self._close()
-        self._replies.append(reply)
-
-    def _close(self) -> None:
-        if self._env is not None:
-            self._env.close()
-        self._env = None
 
 
 def _env_options(
