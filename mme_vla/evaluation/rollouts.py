@@ -1,7 +1,6 @@
 """`rollouts`: episodes as data to learn from, with what the policy saw, what it sampled, and what came of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -86,11 +85,11 @@ def rollouts(
 
     Args:
         policy: with statistics; its weights may change between two calls, not during one.
-        env: `mme_vla`, or a function that makes an environment with the benchmark's interface from `task`, `split`,
-            `episode` and `max_steps`. It may have a method `oracle()` (`mme_vla.envs.oracle`).
+        env: a name as `env=` of the commands, or a function that makes an environment with the benchmark's interface
+            from `task`, `split`, `episode` and `max_steps`. It may have a method `oracle()` (`mme_vla.envs.oracle`).
         jobs: the episodes, `Job(task, split, episode)`.
         keep: of `observations`, `rewards`, `log_probs` and `oracle`.
-        reward: a name in `REWARDS`, for env="mme_vla"; other environments have their own.
+        reward: a name in `REWARDS`, for env="mme_vla"; functions return rewards of their own.
         oracle_share: share of the decisions at which the oracle acts in place of the policy, 0 to 1.
         workers: processes that simulate; 0 simulates in this process, without starting any.
         env_options: further arguments of the environment, such as `{"seed": 7, "difficulty": "easy"}`.
@@ -107,7 +106,8 @@ def rollouts(
         raise UserError(f"rollouts() needs a policy of kind mme, and this is a {type(policy).__name__}.")
     if "log_probs" in keep:
         check_log_prob(policy)
-    run_settings = read_section(RolloutSettings, settings)
+        require(not oracle_share, "log_probs are of the policy's own choices: keep none with oracle_share.")
+    run_settings = read_section(RolloutSettings, settings if callable(env) else {**settings, "env": env})
     oracle = "oracle" in keep or oracle_share > 0
     require(
         not oracle or policy.embodiment.action.choice,
@@ -121,7 +121,7 @@ def rollouts(
     collector = _Collector(
         policy, envs, facts, run_settings, lambda record: None, keep=tuple(keep), oracle_share=oracle_share
     )
-    with envs if workers else nullcontext():
+    with envs:
         for _ in collector.rounds(list(jobs)):
             while collector.finished:
                 yield collector.finished.pop(0)
@@ -195,9 +195,9 @@ def _env_options(
     options: dict[str, Any] = {"max_steps": settings.max_steps, "robot": robot, "oracle": oracle}
     if callable(env):
         return options | {"base": env}
-    check_known("environment", env, ("mme_vla",))
     check_known("reward", reward, REWARDS)
-    options |= {"base": make_env, "render": settings.render, "action_space": robot.action.space, "reward": reward}
+    options |= {"base": make_env, "env": env, "render": settings.render, "reward": reward}
+    options["action_space"] = robot.action.space
     return options | {f"include_{name}": True for name in robot.readings}
 
 
@@ -296,12 +296,9 @@ class _Collector(Rollout):
         keep = self.keep
         rows = [d.row for d in decisions if d.row is not None]
         executed = [self._labelled(d.row, d.state, d.actions) for d in decisions if d.row is not None]
-        taught = [
-            self._labelled(d.row, d.state, d.oracle[None])
-            for d in decisions
-            if d.row is not None and d.oracle is not None
-        ]
-        logs, paths = [d.log_prob for d in decisions], [d.path for d in decisions]
+        targets = [(d.row, d.state, d.oracle[None]) for d in decisions if d.row is not None and d.oracle is not None]
+        log_probs = [d.log_prob for d in decisions if d.log_prob is not None]
+        paths = [d.path for d in decisions if d.path is not None]
         return Trajectory(
             job,
             record.outcome,
@@ -310,9 +307,9 @@ class _Collector(Rollout):
             tuple(d.actions for d in decisions),
             join(executed) if "observations" in keep and rows else None,
             torch.tensor([d.reward for d in decisions]) if "rewards" in keep else None,
-            torch.stack([log for log in logs if log is not None]) if "log_probs" in keep else None,
-            torch.stack([path for path in paths if path is not None]) if all(p is not None for p in paths) else None,
-            join(taught) if "oracle" in keep and taught else None,
+            torch.stack(log_probs) if log_probs else None,
+            torch.stack(paths) if paths else None,
+            join([self._labelled(*target) for target in targets]) if "oracle" in keep and targets else None,
         )
 
     def _labelled(self, row: Batch, state: Tensor, actions: np.ndarray) -> Batch:

@@ -83,6 +83,8 @@ def test_paths_of_a_flow_are_kept_with_their_log_probabilities() -> None:
 def test_what_cannot_be_kept_is_refused(policy: MMEPolicy) -> None:
     with pytest.raises(UserError, match="Unknown part of a trajectory 'reward'"):
         next(rollouts(policy, two_choices, JOBS, ("reward",)))
+    with pytest.raises(UserError, match="the policy's own choices"):
+        next(rollouts(policy, two_choices, JOBS, ("log_probs",), oracle_share=0.5))
     with pytest.raises(UserError, match="episode twice"):
         next(rollouts(policy, two_choices, [JOBS[0], JOBS[0]]))
     with pytest.raises(UserError, match="Unknown reward 'dense'"):

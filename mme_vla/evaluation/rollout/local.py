@@ -45,6 +45,12 @@ class LocalEnvs:
         replies, self._replies = self._replies, []
         return replies
 
+    def __enter__(self) -> "LocalEnvs":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
     def _add(self, reply: Reply) -> None:
         if reply.done:
             self._close()
