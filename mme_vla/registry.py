@@ -108,7 +108,10 @@ BACKBONES: Registry[Any] = Registry(
     "backbone",
     {"pi05": "mme_vla.backbone.pi05", "nano": "mme_vla.backbone.nano", "openvla": "mme_vla.methods.openvla_oft.model"},
 )
-HEADS: Registry[Any] = Registry("flow head", dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"))
+HEADS: Registry[Any] = Registry(
+    "action head",
+    {**dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"), "choice": "mme_vla.backbone.choice"},
+)
 POLICIES: Registry[Any] = Registry(
     "policy",
     {
@@ -149,10 +152,11 @@ PLAYERS: Registry[Any] = Registry(
     },
 )
 INTERVENTIONS: Registry[Any] = Registry("intervention")
+REWARDS: Registry[Any] = Registry("reward", dict.fromkeys(("none", "sparse", "subtask"), "mme_vla.envs.subtasks"))
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
-    "intervention": INTERVENTIONS,
+    "intervention": INTERVENTIONS, "reward": REWARDS,
 }  # fmt: skip
 
 
@@ -161,7 +165,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
+            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe) or `reward`.
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

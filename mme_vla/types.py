@@ -188,6 +188,7 @@ class Batch(TensorStruct):
     view_tokens: [b, v, n, d]; a frozen tower's tokens of `images`, where they were made beforehand.
     overlap: what a sampled chunk is to agree with; None where it is free.
     past: past views that a memory gives along with the current ones; None for all others.
+    options: [b, letters] bool; the letters offered to a policy that chooses among options. None means all.
     """
 
     images: Tensor
@@ -202,6 +203,7 @@ class Batch(TensorStruct):
     view_tokens: Tensor | None = None
     overlap: Overlap | None = None
     past: PastViews | None = None
+    options: Tensor | None = None
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.

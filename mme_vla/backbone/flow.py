@@ -5,14 +5,16 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from itertools import pairwise
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from mme_vla.errors import check_sizes
+from mme_vla.backbone.base import Injection
+from mme_vla.errors import check_sizes, require
 from mme_vla.registry import HEADS
-from mme_vla.types import Noise, Overlap
+from mme_vla.types import Batch, Noise, Overlap
 
 EULER_STEPS = 10  # as released
 MIN_PERIOD, MAX_PERIOD = 4e-3, 4.0
@@ -66,6 +68,20 @@ def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) 
     return x
 
 
+def normal_log_density(x: Tensor, deviation: float) -> Tensor:
+    """Log-density [b] of x [b, …] under independent normal distributions of this standard deviation."""
+    x = x.flatten(1)
+    return -0.5 * (x / deviation).square().sum(1) - x.shape[1] * (math.log(deviation) + 0.5 * math.log(2 * math.pi))
+
+
+def _check_increments(increments: Tensor, steps: int, overlap: Overlap | None) -> None:
+    require(
+        increments.shape[1] == steps,
+        f"flow_steps={steps}: backbone.head.deviation has noise for {increments.shape[1]}; set backbone.head.steps.",
+    )
+    require(overlap is None, "backbone.head.deviation must be 0 for real-time chunking.")
+
+
 Predict = Callable[[Tensor, Tensor], Tensor]
 """`predict(x_t, time)`: the network's output [b, h, a] at noisy chunks [b, h, a] and flow times [b]."""
 PredictAt = Callable[[Tensor, int], Tensor]
@@ -82,10 +98,24 @@ class FlowHead:
         horizon, action_dim: of a chunk [h, a].
         time_distribution: `beta` or `uniform`, see `sample_time`.
         steps: Euler steps unless the caller says otherwise.
+        deviation: σ of Gaussian noise in each Euler step while sampling, in units of normalised actions (policy
+            gradients, `mme_vla.policy.log_prob`); 0 samples without it.
     """
 
-    def __init__(self, horizon: int, action_dim: int, time_distribution: str = "beta", steps: int = EULER_STEPS):
+    supports_rtc: ClassVar[bool] = True
+    """Whether real-time chunking can guide the sampler."""
+
+    def __init__(
+        self,
+        horizon: int,
+        action_dim: int,
+        time_distribution: str = "beta",
+        steps: int = EULER_STEPS,
+        deviation: float = 0.0,
+    ):
         check_sizes("backbone.head", steps=steps)
+        require(deviation >= 0, f"backbone.head.deviation={deviation} must not be negative.")
+        self.deviation = deviation
         self.horizon, self.action_dim = horizon, action_dim
         self.time_distribution, self.steps = time_distribution, steps
 
@@ -95,8 +125,10 @@ class FlowHead:
         return {"noise": noise, "time": sample_time(count, self.time_distribution, noise.device, generator)}
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
-        """The starting `noise` [h, a], on the CPU."""
-        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+        """The starting `noise` [h, a], on the CPU; with `deviation` also `increments` [steps, h, a]."""
+        shape = self.horizon, self.action_dim
+        noise = {"noise": torch.randn(*shape, generator=generator)}
+        return noise | ({"increments": torch.randn(self.steps, *shape, generator=generator)} if self.deviation else {})
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
         """The loss [b, h] of chunks [b, h, a]: squared error of the velocity."""
@@ -111,14 +143,55 @@ class FlowHead:
         """The velocity [b, h, a] at each of so many Euler steps from the network's output."""
         return predict
 
-    def sample(self, predict: PredictAt, noise: Tensor, steps: int, overlap: Overlap | None = None) -> Tensor:
-        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed."""
+    def sample(
+        self,
+        predict: PredictAt,
+        noise: Tensor,
+        steps: int,
+        overlap: Overlap | None = None,
+        increments: Tensor | None = None,
+    ) -> Tensor:
+        """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed.
+
+        increments: [b, steps, h, a], standard normal; `deviation` times them is added in each step.
+        """
+        if increments is not None:
+            _check_increments(increments, steps, overlap)
+            return self.sample_path(predict, noise, increments, self.deviation)[:, -1]
         velocity = self.velocity(predict, steps, noise.device)
         if overlap is not None:
             from mme_vla.speed.rtc import rtc_guidance
 
             velocity = rtc_guidance(velocity, overlap, self.times(steps, noise.device))
         return euler(noise, steps, velocity)
+
+    # Gaussian steps, whose density is known
+
+    def sample_path(self, predict: PredictAt, noise: Tensor, increments: Tensor, deviation: float) -> Tensor:
+        """Every state x_0 … x_k [b, k + 1, h, a] of k Euler steps with noise: x_{i+1} = x_i − v(x_i)/k + σ·ε_i.
+
+        Args:
+            noise: x_0 [b, h, a]. increments: ε [b, k, h, a], standard normal. deviation: σ; 0 is `sample` itself.
+        """
+        steps = increments.shape[1]
+        velocity, states = self.velocity(predict, steps, noise.device), [noise]
+        for index, increment in enumerate(increments.unbind(1)):
+            mean = states[-1] - velocity(states[-1], index).to(noise.dtype) / steps
+            states.append(mean + deviation * increment if deviation else mean)
+        return torch.stack(states, 1)
+
+    def path_log_prob(self, predict: PredictAt, path: Tensor, deviation: float) -> Tensor:
+        """Log-density [b] of the states [b, k + 1, h, a] that `sample_path` made: log N(x_0) + Σ log N(x_{i+1} | x_i).
+
+        Gradients reach the network's parameters, and not the states.
+        """
+        steps = path.shape[1] - 1
+        velocity, states = self.velocity(predict, steps, path.device), path.detach().unbind(1)
+        log_prob = normal_log_density(states[0], 1.0)
+        for index, (state, reached) in enumerate(pairwise(states)):
+            error = reached - state + velocity(state, index).to(path.dtype) / steps
+            log_prob = log_prob + normal_log_density(error, deviation)
+        return log_prob
 
 
 @HEADS.register("clean_flow")
@@ -147,6 +220,17 @@ class HasFlowHead:
     """
 
     head: FlowHead
+
+    def predictor(self, batch: Batch, injection: Injection) -> Predict:
+        """The network's output at noisy chunks [b, h, a] and flow times [b], with gradient, for one observation."""
+        raise NotImplementedError
+
+    def sample_chunk(
+        self, predict: PredictAt, noise: Mapping[str, Tensor], steps: int, overlap: Overlap | None
+    ) -> Tensor:
+        """The chunk [b, h, a] that the head samples from noise as `sampling_noise` makes it."""
+        more = {"increments": noise["increments"]} if "increments" in noise else {}
+        return self.head.sample(predict, noise["noise"], steps, overlap, **more)
 
     def make_head(self, config: Any) -> None:
         """Build the head that `config.head` names, for the sizes and the time distribution of `config`."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hook, Injection, bind_hook
 from mme_vla.backbone.config import ExpertConfig, check_positive
-from mme_vla.backbone.flow import HasFlowHead, time_embedding
+from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import initialise
@@ -294,7 +294,11 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         def clean(x: Tensor, index: int) -> Tensor:
             return self.denoise(context, x, times[index].expand(len(x)), 1)
 
-        return self.head.sample(clean, start, steps, batch.overlap)
+        return self.sample_chunk(clean, noise, steps, batch.overlap)
+
+    def predictor(self, batch: Batch, injection: Injection) -> Predict:
+        context = self.read_context(batch, injection)
+        return lambda x_t, time: self.denoise(context, x_t, time, 1)
 
     def read_context(self, batch: Batch, injection: Injection) -> Context:
         """All that does not depend on the noise."""

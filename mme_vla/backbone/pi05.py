@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
-from mme_vla.backbone.flow import HasFlowHead, time_embedding
+from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, float32_linear
 from mme_vla.backbone.siglip import VisionTower
@@ -136,6 +136,9 @@ class Pi05Backbone(
         assert batch.actions is not None
         return self.head.loss(partial(self.velocity, injection), batch.actions, noise)
 
+    def predictor(self, batch: Batch, injection: Injection) -> Predict:
+        return partial(self.velocity, injection)
+
     def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
         """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
@@ -175,7 +178,7 @@ class Pi05Backbone(
         def velocity(x_t: Tensor, i: int) -> Tensor:
             return self.denoise(x_t, conditions.at(i, rows), layout, past, injection)
 
-        return self.head.sample(velocity, x, steps, batch.overlap)
+        return self.sample_chunk(velocity, noise, steps, batch.overlap)
 
     def prefill(self, injection: Injection) -> KVCache:
         """Keys and values of the prefix, which all steps of a chunk share."""

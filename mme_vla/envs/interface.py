@@ -28,8 +28,9 @@ from mme_vla.envs.observations import (
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
-from mme_vla.envs.subtasks import NO_RECORD, REWARDS
+from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError, check_known, require
+from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
     from mme_vla.envs.subtasks import SubTask
@@ -115,7 +116,7 @@ class RoboMMEEnv(gymnasium.Env):
         max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
-        reward: `none`, as in the benchmark, `sparse` or `subtask` (`mme_vla.envs.subtasks`).
+        reward: `none`, as in the benchmark, `sparse`, `subtask` (`mme_vla.envs.subtasks`), or your own in `REWARDS`.
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.

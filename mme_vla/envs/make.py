@@ -56,7 +56,7 @@ def make_env(
         row: builds the scene of these values (`env.scene_values()`) instead of an episode of the split.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
-            share for each sub-task of the execution as it is done, 1 in all.
+            share for each sub-task of the execution as it is done, 1 in all. Or your own, registered in `REWARDS`.
         env: `mme_vla`, or `official` for the installed package `robomme`.
         sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.errors import brief, require
+from mme_vla.registry import REWARDS
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -138,18 +139,27 @@ class Progress:
         return self.index >= len(self.subtasks)
 
 
-def _subtask_share(progress: Progress, success: bool) -> float:
+# A reward is a function `(progress, success) -> float`: the return so far. A step's reward is what it adds.
+
+
+@REWARDS.register("none")
+def no_reward(progress: Progress, success: bool) -> float:
+    """Always 0, as in the benchmark."""
+    return 0.0
+
+
+@REWARDS.register("sparse")
+def success_reward(progress: Progress, success: bool) -> float:
+    """1 with the step that succeeds."""
+    return float(success)
+
+
+@REWARDS.register("subtask")
+def subtask_reward(progress: Progress, success: bool) -> float:
     """The share of the execution's sub-tasks that are done; those of the conditioning video do not count."""
     execution = [i for i, subtask in enumerate(progress.subtasks) if not subtask.video]
     return sum(i < progress.index for i in execution) / len(execution)
 
-
-REWARDS: dict[str, Callable[[Progress, bool], float]] = {
-    "none": lambda progress, success: 0.0,
-    "sparse": lambda progress, success: float(success),
-    "subtask": _subtask_share,
-}
-"""Return so far, 0 to 1, from the progress and the success of the episode, by the name of the reward."""
 
 MOTION = "motion"
 BROKEN = ("wrong", "stuck")

@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -99,34 +99,16 @@ class OraclePlayer(Player):
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
         """See `Player`."""
-        from mme_vla.envs.grounding import project
+        from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 
         task = getattr(session.env, "task", None)
         if task is None:
             raise UserError("player=oracle reads the script of this library's tasks: use it with env=mme_vla.")
-        subtask = task.progress.current
-        if subtask is None:
-            _stuck("every sub-task is done, but the episode has not ended")
-        if subtask.video:
-            _stuck(f"the conditioning video did not succeed ({subtask.text!r}), so the task cannot be done")
-        choices = {choice.label: choice for choice in task.choices()}
-        choice = choices.get(subtask.choice)
-        if choice is None:
-            _stuck(f"the sub-task {subtask.text!r} has no option")
-        note = {"subtask": subtask.text}
-        if choice.candidates is None:
-            return {"choice": choice.label, "point": None}, note
-        candidates = list(choice.candidates())
-        # A sub-task may name the button it ends at as well: the point is of what the option chooses among.
-        meant = [thing for thing in subtask.targets if any(thing is candidate for candidate in candidates)]
-        if not meant:
-            _stuck(f"the sub-task {subtask.text!r} is about nothing that its option can choose")
-        pixel = np.clip(np.rint(project(meant[0].position)), 0, SIDE - 1)
-        return {"choice": choice.label, "point": pixel.tolist()}, note
-
-
-def _stuck(reason: str) -> NoReturn:
-    raise NoChoiceError("error", f"the oracle is stuck: {reason}")
+        try:
+            choice, text = oracle_choice(task)
+        except OracleStuckError as error:
+            raise NoChoiceError("error", str(error)) from None
+        return choice, {"subtask": text}
 
 
 def build_player(config: Mapping[str, Any]) -> Player:

@@ -12,11 +12,12 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
+from mme_vla.policy.acting import choose_actions
 from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
-from mme_vla.types import Noise, stack_noise
+from mme_vla.types import Noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -114,10 +115,9 @@ class Policy(nn.Module):
         if isinstance(episodes, Episode):
             single: np.ndarray = self.act([episodes], steps)[0]
             return single
-        processor, space = self.require_processor(), self.embodiment.action
-        n_past = processor.samples.window - 1
         if not episodes:
-            return np.zeros((0, self.horizon - n_past, space.width), np.float32)
+            n_past = self.require_processor().samples.window - 1
+            return np.zeros((0, self.horizon - n_past, self.embodiment.action.width), np.float32)
         supports_rtc = isinstance(self, SupportsRTC) and self.supports_rtc
         if not supports_rtc and any(e.action_prefix is not None for e in episodes):
             name = self.config.get("name", type(self).__name__)
@@ -125,21 +125,12 @@ class Policy(nn.Module):
                 f"{name} does not support real-time chunking, which needs a flow policy such as π0.5. Leave out "
                 "set_action_prefix()."
             )
-        processor.require_stats()  # before the noise or memory of an episode changes
-        batch = self.observation(episodes)
-        noise = stack_noise([e.draw() for e in episodes])
-        was_training = self.training
-        self.eval()
-        try:
-            chunk = self.predict_chunk(batch, episodes, noise, steps).float().cpu()
-        finally:
-            self.train(was_training)
-        absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
-        decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
-        actions = torch.stack(decided).numpy()[:, n_past:]
-        for episode, actions_of in zip(episodes, actions, strict=True):
-            episode.acted(actions_of)
-        return actions
+        waiting = episodes
+
+        def predict(batch: Any, noise: Mapping[str, Tensor]) -> Tensor:
+            return self.predict_chunk(batch, waiting, noise, steps)
+
+        return choose_actions(self, waiting, predict).actions
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """The current observations of episodes, as a batch of the processor's kind on the policy's device."""

@@ -82,7 +82,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         self._set_backends(attention, checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         if isinstance(backbone, HasFlowHead):
-            self.sample_steps, self.supports_rtc = backbone.head.steps, True
+            self.sample_steps, self.supports_rtc = backbone.head.steps, backbone.head.supports_rtc
 
     def _set_backends(self, attention: str, float32_products: str) -> None:
         if isinstance(self.backbone, HasAttentionBackends):

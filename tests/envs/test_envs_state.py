@@ -10,8 +10,9 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from mme_vla.envs import make_env
 from mme_vla.envs.interface import RoboMMEEnv
-from mme_vla.envs.subtasks import REWARDS, Progress, SubTask
+from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError
+from mme_vla.registry import REWARDS
 
 
 def joints(env: RoboMMEEnv, k: int) -> np.ndarray:

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state
+from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
 from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.oracle import oracle_of
 from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
@@ -74,7 +75,8 @@ class ChunkEnv:
             than this is executed, as in the benchmark.
         video: records the episode.
         robot: the cameras that are read and the width of an action.
-        most_actions: actions that are executed at most, whatever frames they took; then the outcome is `timeout`.
+        max_actions: actions that are executed at most, whatever frames they took; then the outcome is `timeout`.
+        oracle: whether reports name the action [w] that the task's script takes next (`oracle`).
     """
 
     def __init__(
@@ -85,8 +87,9 @@ class ChunkEnv:
         video: EpisodeVideo | None = None,
         robot: Embodiment = ROBOMME_JOINT,
         max_actions: int | None = None,
+        oracle: bool = False,
     ) -> None:
-        self._robot, self._stick = robot, stick
+        self._robot, self._stick, self._oracle = robot, stick, oracle
         self._max_actions, self._executed = max_actions, 0
         self._max_steps, self._video = max_steps, video
         self._clock = RenderClock()
@@ -119,10 +122,10 @@ class ChunkEnv:
         requested, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
-            The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
-            actions, and `steps`, that of frames.
+            The frames of the executed actions, the sum of their rewards, terminated, truncated, and the report with
+            `executed`, the number of actions, and `steps`, that of frames.
         """
-        frames, executed, n_frames = _Frames(self._robot), 0, 0
+        frames, executed, n_frames, total_reward = _Frames(self._robot), 0, 0, 0.0
         terminated = truncated = False
         info: dict[str, Any] = {}
         draw: RenderRequest | None = command.get("draw")
@@ -130,10 +133,11 @@ class ChunkEnv:
         for number, action in enumerate(actions, 1):
             self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
             with self._simulation():
-                observation, _, ended, cut, info = self._env.step(
+                observation, reward, ended, cut, info = self._env.step(
                     benchmark_action(self._robot.action, action, self._stick, self._pose)
                 )
             terminated, truncated = bool(ended), bool(cut)
+            total_reward += float(reward)
             if info.get("status") == "error":
                 terminated = True
                 if _is_unreachable(observation, info):
@@ -155,7 +159,7 @@ class ChunkEnv:
         report = self._report(info) | {"executed": executed, "steps": n_frames}
         if terminated or truncated:
             report |= self._finish_video(report)
-        return frames.observation(), 0.0, terminated, truncated, report
+        return frames.observation(), total_reward, terminated, truncated, report
 
     def close(self) -> None:
         """Free the simulator; an unfinished video is removed."""
@@ -192,10 +196,16 @@ class ChunkEnv:
             report["process"] = process_score(progress, str(report.get("status"))).to_dict()
         if (began := getattr(self._env, "began", None)) is not None:
             report["began"] = began
+        if self._oracle and report.get("status") == "ongoing":
+            report["oracle"] = self._oracle_action()
         report["seconds"] = {"sim": self._simulating, "render": self._rendered}
         self._simulating = self._rendered = 0.0
         self._goal = str((report.get("task_goal") or [getattr(self, "_goal", "")])[0])
         return report
+
+    def _oracle_action(self) -> np.ndarray | None:
+        choice = oracle_of(self._env)
+        return None if choice is None else choice_row(str(choice["choice"]).lower(), choice.get("point") or ())
 
     def _draw(self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None) -> None:
         if self._video is not None:
@@ -274,12 +284,13 @@ def make_rollout_env(
     videos: tuple[str, str] | None = None,
     robot: Embodiment = ROBOMME_JOINT,
     max_actions: int | None = None,
+    oracle: bool = False,
     **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
 
     base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`. videos: folder, and
-    which outcomes are kept: `all`, `success` or `failure`. robot, most_actions: the policy's.
+    which outcomes are kept: `all`, `success` or `failure`. robot, max_actions: the policy's. oracle: see `ChunkEnv`.
     """
     video = None
     if videos is not None:
@@ -292,4 +303,5 @@ def make_rollout_env(
         video=video,
         robot=robot,
         max_actions=max_actions,
+        oracle=oracle,
     )

@@ -6,7 +6,7 @@ for a slow one, and a long conditioning video is read in pieces between batches.
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from mme_vla.envs import metadata
+from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord
@@ -132,6 +133,11 @@ class Rollout:
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
         """Run these episodes."""
+        for _ in self.rounds(jobs):
+            pass
+
+    def rounds(self, jobs: Sequence[Job] | Waiting) -> Iterator[None]:
+        """Run these episodes; yields whenever the policy has done what it could for those that wait."""
         begun = time.perf_counter()
         self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
         for worker in range(self.envs.workers):
@@ -140,6 +146,7 @@ class Rollout:
             for reply in self.envs.recv(0 if self._scheduler else None):
                 self._take(reply)
             self._run_scheduler()
+            yield
         self.workload.wall_s += time.perf_counter() - begun
 
     def _start(self, worker: int) -> None:
@@ -220,7 +227,7 @@ class Rollout:
             latency = time.perf_counter() - begun
             for running, subgoal in zip(batch, subgoals, strict=True):
                 running.set_subgoal(subgoal, latency)
-        chunks = self.policy.act([running.episode for running in batch], self.settings.flow_steps)
+        chunks = self._choose(batch)
         self.workload.batches += 1
         self.workload.chunks += len(batch)
         share = (time.perf_counter() - begun) / len(batch)
@@ -235,13 +242,20 @@ class Rollout:
             self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
             self._scheduler.later[running] = None
 
+    def _choose(self, batch: list[RunningEpisode]) -> np.ndarray:
+        """The chunks [n, h, w] that these episodes execute the first actions of."""
+        return self.policy.act([running.episode for running in batch], self.settings.flow_steps)
+
+    def _spec(self, job: Job) -> EpisodeSpec:
+        return metadata.episode(job.task, job.split, job.episode)
+
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         """Record an episode and let its worker begin another."""
         job = running.job
         outcome = status if status in ("success", "fail", "timeout") else "error"
         if outcome == "error":
             error = error or f"the environment ended the episode with the status {status!r}"
-        spec = metadata.episode(job.task, job.split, job.episode)
+        spec = self._spec(job)
         robot = self.policy.embodiment
         record = EpisodeRecord(
             **vars(self.facts), action_space=robot.action.answers or robot.name, task=job.task, episode=job.episode,

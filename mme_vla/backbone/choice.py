@@ -1,0 +1,108 @@
+"""A categorical head: letters of the options by cross-entropy, all other numbers by regression, in one pass."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.flow import FlowHead, Predict, PredictAt, normal_log_density
+from mme_vla.errors import require
+from mme_vla.registry import HEADS
+from mme_vla.types import Noise, Overlap
+
+
+@HEADS.register("choice")
+class ChoiceHead(FlowHead):
+    """Reads the network's output as logits of letters and means of the other numbers.
+
+    The network sees no noise: its noisy chunk is 0 and its flow time 1. A sampled letter is the best score among those
+    offered (`ActionSpace.decide`), and a score is a logit with Gumbel noise, so that the choice is an exact sample of
+    the softmax over the offered letters.
+
+    Args:
+        horizon, action_dim: of a chunk [h, a]. time_distribution: has no effect.
+        choice: the columns of the letters, `embodiment.action.choice`.
+        temperature: of the letters' softmax while sampling; 0 takes the best letter.
+        deviation: standard deviation of the other numbers while sampling, in normalised units; 0 takes the mean.
+    """
+
+    supports_rtc = False
+
+    def __init__(
+        self,
+        horizon: int,
+        action_dim: int,
+        choice: Sequence[int],
+        time_distribution: str = "beta",
+        temperature: float = 1.0,
+        deviation: float = 0.0,
+    ):
+        super().__init__(horizon, action_dim, time_distribution, steps=1, deviation=deviation)
+        require(
+            len(choice) and all(0 <= place < action_dim for place in choice),
+            f"backbone.head.choice={list(choice)} must list the columns of the letters, 0 to {action_dim - 1}. Set "
+            "embodiment=robomme_choice and head.choice=${embodiment.action.choice}.",
+        )
+        require(temperature >= 0, f"backbone.head.temperature={temperature} must not be negative.")
+        self.choice, self.temperature = list(choice), temperature
+        self.numbers = [place for place in range(action_dim) if place not in self.choice]
+
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """`noise` [n, h, a] of zeros and `time` [n] of ones: the loss has no noise."""
+        return {"noise": torch.zeros(count, self.horizon, self.action_dim), "time": torch.ones(count)}
+
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        """`noise` [h, a] on the CPU: standard Gumbel for letters, standard normal for the other numbers."""
+        uniform = torch.rand(self.horizon, len(self.choice), generator=generator).clamp(min=1e-20)
+        noise = torch.randn(self.horizon, self.action_dim, generator=generator)
+        noise[:, self.choice] = -(-uniform.log()).log()
+        return {"noise": noise}
+
+    def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
+        """The loss [b, h]: cross-entropy of the letter plus the mean squared error of the other numbers."""
+        output = predict(noise["noise"], noise["time"]).float()
+        letters = actions[..., self.choice].argmax(-1)
+        loss = nn.functional.cross_entropy(output[..., self.choice].movedim(-1, 1), letters, reduction="none")
+        if self.numbers:
+            loss = loss + (output[..., self.numbers] - actions[..., self.numbers].float()).square().mean(-1)
+        return loss
+
+    def times(self, steps: int, device: torch.device) -> Tensor:
+        """Ones [steps]."""
+        return torch.ones(steps, device=device)
+
+    def sample(
+        self,
+        predict: PredictAt,
+        noise: Tensor,
+        steps: int,
+        overlap: Overlap | None = None,
+        increments: Tensor | None = None,
+    ) -> Tensor:
+        """Scores of the letters and the other numbers, [b, h, a]."""
+        output = predict(torch.zeros_like(noise), 0).float()
+        scale = output.new_full((self.action_dim,), self.deviation)
+        scale[self.choice] = self.temperature
+        return output + scale * noise
+
+    def log_prob(self, predict: PredictAt, chunk: Tensor, options: Tensor | None) -> Tensor:
+        """Log-probability [b, h] of the choices that `ActionSpace.decide` makes of sampled chunks [b, h, a].
+
+        Args:
+            chunk: what `sample` returned, or the executed actions as the network predicts them.
+            options: [b, letters] bool; the letters offered. None means all.
+
+        Returns:
+            Log-probability of the letter, plus the log-density of the other numbers if `deviation` is positive.
+        """
+        require(self.temperature > 0, "backbone.head.temperature=0 has no log-probability: set a positive temperature.")
+        output = predict(torch.zeros_like(chunk), 0).float()
+        logits, scores = output[..., self.choice] / self.temperature, chunk[..., self.choice]
+        if options is not None:
+            logits, scores = (x.masked_fill(~options[:, None], -torch.inf) for x in (logits, scores))
+        log_prob = logits.log_softmax(-1).gather(-1, scores.argmax(-1, keepdim=True))[..., 0]
+        if self.deviation and self.numbers:
+            error = (chunk - output)[..., self.numbers]
+            density = normal_log_density(error.flatten(0, 1), self.deviation).unflatten(0, error.shape[:2])
+            log_prob = log_prob + density
+        return log_prob

@@ -1,0 +1,71 @@
+"""The DAgger example from another folder: it learns VideoUnmask from nothing, and every command takes its policy."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers import REPOSITORY, commands
+from mme_vla.envs.rendering import render_backend
+from mme_vla.errors import UserError
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.serving.client import Client
+
+EXAMPLES = REPOSITORY / "examples" / "trajectories"
+ENVIRONMENT = {"PYTHONPATH": f"{REPOSITORY}:{EXAMPLES}", "OMP_NUM_THREADS": "1"}
+OPTIONS = [{"label": label, "action": f"press button {label}", "need_parameter": label == "a"} for label in "ab"]
+
+
+def run(folder: Path, module: str, *words: str) -> str:
+    done = commands.run(module, *words, cwd=folder, env=ENVIRONMENT)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.parametrize("file", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_an_example_is_short_and_uses_no_private_name(file: str) -> None:
+    text = (EXAMPLES / file).read_text()
+    assert len(text.splitlines()) <= 60
+    assert not re.findall(r"import _|(?<!self)\._[a-z]", text)
+
+
+@pytest.mark.slow
+def test_dagger_learns_from_nothing_and_its_policy_works_in_every_command(tmp_path: Path) -> None:
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    rates = [float(rate) for rate in re.findall(r"success (\d\.\d+)", run(tmp_path, "dagger"))]
+    assert rates[0] == 1.0 and rates[-1] >= 0.91
+    trained = "checkpoint=outputs/dagger"
+    run(tmp_path, "mme_vla.evaluate", trained, "tasks=VideoUnmask", "episodes=1", "workers=1", "output=evaluated")
+    (record,) = read_folders(find_records([tmp_path / "evaluated"]))
+    assert record.outcome in ("success", "fail"), record.error
+    probe = ("offline=false", "online=true", "tasks=VideoUnmask", "episodes=1", "with=[shuffle]", "workers=1")
+    run(tmp_path, "mme_vla.probe", trained, *probe, "output=probed")
+    assert list((tmp_path / "probed").rglob("*.json*"))
+    served(tmp_path, trained)
+
+
+def served(folder: Path, checkpoint: str) -> None:
+    """A choice from a server in a process of its own."""
+    server = commands.start("mme_vla.serve", checkpoint, "port=0", cwd=folder, env=ENVIRONMENT)
+    try:
+        lines = ""
+        assert server.stderr is not None
+        while "ready at ws://127.0.0.1:" not in lines and (line := server.stderr.readline()):
+            lines += line
+        port = int(lines.split("ready at ws://127.0.0.1:")[1].split()[0])
+        with Client(f"ws://127.0.0.1:{port}") as client:
+            client.reset()
+            reply = client.infer({
+                "task_goal": ["press the button"], "is_first_step": True, "available_multi_choices": OPTIONS,
+                "front_rgb_list": [np.zeros((256, 256, 3), np.uint8)],
+                "joint_state_list": [np.zeros(7)], "gripper_state_list": [np.zeros(2)],
+            })  # fmt: skip
+        assert reply["choices"][0]["choice"] in ("A", "B")
+    finally:
+        server.kill()
+        server.wait()
