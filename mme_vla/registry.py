@@ -145,10 +145,14 @@ PLAYERS: Registry[Any] = Registry(
     },
 )
 INTERVENTIONS: Registry[Any] = Registry("intervention")
+HISTORY_TRANSFORMS: Registry[Any] = Registry(
+    "history transform",
+    dict.fromkeys(("repeat_frame", "speed", "drop_frames", "noise"), "mme_vla.memory.transforms"),
+)
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
-    "intervention": INTERVENTIONS,
+    "intervention": INTERVENTIONS, "history_transform": HISTORY_TRANSFORMS,
 }  # fmt: skip
 
 
@@ -157,7 +161,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
+            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe) or `history_transform`.
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

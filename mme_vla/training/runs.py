@@ -154,7 +154,8 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration with what runs of earlier versions did not say, because there was no other choice."""
     train = {f.name: f.default for f in fields(TrainSettings) if f.default is not MISSING and f.name != "seed"}
-    data = dict(config.get("data") or {})
+    data = {"history_transforms": [], **(config.get("data") or {})}
+    learning = {"learning": {"history_transforms": [], **config["learning"]}} if config.get("learning") else {}
     if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:  # now the default
         data["val_episodes"] = None
     return {
@@ -162,6 +163,7 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         "embodiment": embodiment_of(config).to_dict(),
         "train": {**train, **config["train"]},
         "data": data,
+        **learning,
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
         **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
