@@ -185,8 +185,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             return source.past_actions(step.episode, step.index, most, self.action_offset)
         now = int(frames.transformed(np.array(step.index)))
         rows = frames.real[max(frames.exec_start, now - most) : now] + self.action_offset
-        first = int(rows[0]) if len(rows) else 0
-        return source.actions(step.episode, first, int(rows[-1]) + 1 if len(rows) else 0)[rows - first]
+        if not len(rows):
+            return source.past_actions(step.episode, step.index, 0, self.action_offset)
+        return source.actions(step.episode, int(rows[0]), int(rows[-1]) + 1)[rows - rows[0]]
 
     def observation(self, index: int) -> dict[str, Any]:
         """Return the item whose last step is `index`, as it would be met when acting: without transforms."""
