@@ -18,5 +18,6 @@ class Hesitate(HistoryTransform):
 
     def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
         frames = np.arange(length)
-        again = np.floor((frames + 1) * self.p) > np.floor(frames * self.p) if rng is None else rng.random(length) < self.p
+        often = np.floor((frames + 1) * self.p) > np.floor(frames * self.p)
+        again = often if rng is None else rng.random(length) < self.p
         return 1 + self.times * (again & (frames >= exec_start))

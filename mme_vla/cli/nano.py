@@ -135,7 +135,8 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
                 )  # fmt: skip
         if row == next(iter(composed)) and config["films"] and config["shard"] is None:
             with minutes.of("films"):
-                videos = record_videos(checkpoints[0], folder / "films", records[row][: len(records[row]) // len(checkpoints)])
+                of_first = records[row][: len(records[row]) // len(checkpoints)]
+                videos = record_videos(checkpoints[0], folder / "films", of_first)
     if config["shard"] is not None:
         return folder
     if config["planner"]:

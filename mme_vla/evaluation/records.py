@@ -30,7 +30,9 @@ class RunKey(NamedTuple):
     def __str__(self) -> str:
         name = self.model if self.subgoal is None else f"{self.model}+{self.subgoal}"
         name = name if self.memory_budget is None else f"{name}, {self.memory_budget} memory tokens"
-        trained = "" if self.training is None else f", training seed {self.training.seed} of recipe {(self.training.recipe or '?')[:6]}"
+        trained = ""
+        if self.training is not None:
+            trained = f", training seed {self.training.seed} of recipe {str(self.training.recipe)[:6]}"
         return f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
 
 

@@ -132,8 +132,10 @@ def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:
     """The transforms that a configuration lists, in the order in which they act."""
     require(
         entries is None
-        or isinstance(entries, list | tuple)
-        and all(isinstance(e, str) or (isinstance(e, Mapping) and "name" in e) for e in entries),
+        or (
+            isinstance(entries, list | tuple)
+            and all(isinstance(e, str) or (isinstance(e, Mapping) and "name" in e) for e in entries)
+        ),
         f"history_transforms={entries}: write a list of names or of mappings with a name, such as [repeat_frame] or "
         "[{name: speed, factor: 2}].",
     )

@@ -37,9 +37,7 @@ def write_page(
     runs = {
         model: training_folders(folder / model, config.get("trainings", 1)) for model in records if model != PLANNER
     }
-    ends = {
-        model: [read_json(run / DONE, "a training's end") for run in folders] for model, folders in runs.items()
-    }
+    ends = {model: [read_json(run / DONE, "a training's end") for run in folders] for model, folders in runs.items()}
     results, comparisons = compared(records, config["task"], config["split"], without)
     curves = {
         model if len(folders) == 1 else f"{model}, {run.name}": learning_curve(run)

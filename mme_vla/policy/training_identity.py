@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 from mme_vla.config.naming import digest, flat
 from mme_vla.config.sections import Range, read_section
-from mme_vla.policy.tensor_files import list_weight_files
 from mme_vla.utils import Sums
 
 KEY = "training"
@@ -66,6 +65,8 @@ def identity_of(config: Mapping[str, Any]) -> TrainingIdentity | None:
 
 def weights_digest(folder: Path) -> str | None:
     """Twelve letters of the checksums of a checkpoint's weights; None where it has no checksums."""
+    from mme_vla.policy.tensor_files import list_weight_files  # PyTorch, which results do without
+
     table = Sums(folder).table
     sums = [table[name] for name in sorted(list_weight_files(folder)) if name in table]
     return digest({"weights": sums}, 12) if sums else None

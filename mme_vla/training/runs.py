@@ -31,8 +31,8 @@ PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
 
 MAY_DIFFER = (
-    "name", "full_size", "output", "resume", "trainings", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
-    "train.save_every", "train.keep", "train.parallel", "train.prefetch_gb", "train.workers",
+    "name", "full_size", "output", "resume", "trainings", "init_from", "logger", "train.steps", "train.log_every",
+    "train.val_every", "train.save_every", "train.keep", "train.parallel", "train.prefetch_gb", "train.workers",
     "train.open_loop_chunks", "train.device",
     "data.cache", "data.content", "trust_plugins",
 )  # fmt: skip

@@ -1,11 +1,13 @@
 """Several trainings of one recipe are one method, and two recipes are never averaged."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from helpers import REPOSITORY
 from helpers.rollout_fakes import quick_policy
 from mme_vla.evaluation.records import EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import aggregate, bootstrap
@@ -54,7 +56,8 @@ def test_two_recipes_are_not_averaged() -> None:
 def test_records_without_a_training_have_the_figures_they_had() -> None:
     plain = [replace(record, training=None) for record in (*records(8), *records(6, model_seed=8))]
     read = merge([EpisodeRecord.from_json(record.to_json()) for record in plain])
-    old = [EpisodeRecord.from_dict({k: v for k, v in vars(r).items() if k != "training"} | {"seconds": {}}) for r in read]
+    lines = [{key: value for key, value in vars(record).items() if key != "training"} for record in read]
+    old = [EpisodeRecord.from_dict(line | {"seconds": {}}) for line in lines]
     figures = [aggregate(part, PROTOCOL).methods[0].average for part in (plain, old)]
     assert figures[0] == figures[1] and figures[0].std == pytest.approx(np.std([80, 60], ddof=1))
 
@@ -99,3 +102,10 @@ def test_records_copy_the_training_of_a_checkpoint(tmp_path: Path) -> None:
     policy.save_pretrained(tmp_path / "two")
     other = facts_of(Policy.from_pretrained(str(tmp_path / "two")), None, "two", RolloutSettings(), None).training
     assert other == replace(facts.training, weights=other.weights if other else None) and other != facts.training
+
+
+def test_the_code_of_the_page_runs() -> None:
+    (block,) = re.findall(
+        r"```python\n(.*?)```", (REPOSITORY / "docs" / "extend" / "several-trainings.md").read_text(), re.DOTALL
+    )
+    exec(compile(block, "docs/extend/several-trainings.md", "exec"), {})

@@ -54,8 +54,8 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
 
     monkeypatch.setattr(evaluating, "run_episodes", episodes)
     words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul,tokendrop_modul", "budget=2,4"])
-    words += ["trainings=2", "beside=[]", "drawn_for=[]", "planner=false", "films=false", "train.steps=2",
-              "train.val_samples=4", "train.batch_size=2", "train.log_every=1", f"output={tmp_path / 'run'}"]  # fmt: skip
+    words += ["trainings=2", "beside=[]", "drawn_for=[]", "planner=false", "films=false", f"output={tmp_path / 'run'}"]
+    words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]
     page = command.run(plain(compose("nano", words))).read_text()
     assert len(recorded) == 1 and made == [2, 2, 4, 4, 2, 2, 4, 4]  # to learn from and to measure by
     for name in ("framesamp_modul-every_8-grid_1", "tokendrop_modul-grid_1"):

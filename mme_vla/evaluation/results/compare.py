@@ -92,9 +92,7 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     means = 100 * np.mean([[side.mean() for side in sides] for sides in by_task.values()], axis=0)
     gaps = {task: first.mean(1) - second.mean(1) for task, (first, second) in by_task.items()}
     trained = any(len(method.trainings) > 1 for method in (first, second))
-    drawn = {
-        task: [sides[0], -sides[1]] if trained else [gaps[task][:, None]] for task, sides in by_task.items()
-    }
+    drawn = {task: [sides[0], -sides[1]] if trained else [gaps[task][:, None]] for task, sides in by_task.items()}
     everything = np.concatenate(list(gaps.values()))
     wins, losses = int((everything > 0).sum()), int((everything < 0).sum())
     p = sign_test(wins, losses)
