@@ -99,8 +99,8 @@ class FedEpisode(Episode):
         self._host, self.seed = host, seed
         self.inner = host.inner.start_episode(goal, seed)
         self.exec_start: int | None = None
-        self._counts = np.zeros(0, np.int64)
-        self._starts = np.zeros(0, np.int64)
+        self._counts: np.ndarray = np.zeros(0, np.int64)
+        self._starts: np.ndarray = np.zeros(0, np.int64)
         self.boundaries: Sequence[int] = ()
 
     def observe(

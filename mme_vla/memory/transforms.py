@@ -6,7 +6,7 @@ sample reads of the past (`data.history_transforms`), and a probe applies the sa
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -118,14 +118,14 @@ class Noise(HistoryTransform):
 
 def build_transform(entry: Any) -> HistoryTransform:
     """A transform from its name, or from a mapping with `name` and its options."""
-    section = {"name": entry} if isinstance(entry, str) else entry
-    kind: Any = HISTORY_TRANSFORMS[section.get("name")]
+    section: Mapping[str, Any] = {"name": entry} if isinstance(entry, str) else entry
+    kind: Any = HISTORY_TRANSFORMS[section["name"]]
+    if not is_dataclass(kind):
+        made: HistoryTransform = HISTORY_TRANSFORMS.build(section)
+        return made
     options = {key: value for key, value in section.items() if key != "name"}
-    made = (
-        read_section(kind, options, f"history_transforms.{section['name']}")
-        if is_dataclass(kind) else HISTORY_TRANSFORMS.build(section)
-    )  # fmt: skip
-    return made  # type: ignore[no-any-return]
+    read: Any = read_section(kind, options, f"history_transforms.{section['name']}")  # type: ignore[arg-type]
+    return cast(HistoryTransform, read)
 
 
 def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:

@@ -218,8 +218,9 @@ class Transform(Intervention):
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
         if "entries" not in self.needs:
             return store
-        slots, views = store.occupied, {}
-        contents = []
+        slots = store.occupied
+        views: dict[int, _Perturbed] = {}
+        contents: list[Any] = []
         for content in (_content(store, slot) for slot in slots):
             if isinstance(content, Tensor):
                 rows = self.transform.perturb(content.reshape(-1, content.shape[-1]), moment.rng)
