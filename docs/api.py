@@ -72,7 +72,9 @@ def section(name: str) -> str:
     """A name with its signature, its words and, for a class, its methods."""
     thing = getattr(mme_vla, name)
     called = signature(thing)
-    head = f"from mme_vla import {name}  # {thing.__module__}" + (f"\n{name}{called}" if called not in ("", "()") else "")
+    head = f"from mme_vla import {name}  # {thing.__module__}" + (
+        f"\n{name}{called}" if called not in ("", "()") else ""
+    )
     parts = [f"### `{name}`", f"```python\n{head}\n```", text_of(thing)]
     if inspect.isclass(thing) and not issubclass(thing, Exception):
         for method, member in members(thing):
