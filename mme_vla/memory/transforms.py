@@ -133,7 +133,8 @@ def build_transforms(entries: Any) -> tuple[HistoryTransform, ...]:
     require(
         entries is None
         or (
-            isinstance(entries, list | tuple)
+            isinstance(entries, Sequence)
+            and not isinstance(entries, str)
             and all(isinstance(e, str) or (isinstance(e, Mapping) and "name" in e) for e in entries)
         ),
         f"history_transforms={entries}: write a list of names or of mappings with a name, such as [repeat_frame] or "

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy, UserError
+from mme_vla.cli import evaluate as evaluation
 from mme_vla.cli import train as command
 from mme_vla.config.composition import compose
 from mme_vla.evaluation.rollout.evaluation import facts_of
@@ -52,6 +53,10 @@ def test_several_trainings_resume_and_share_a_cache(tmp_path: Path, monkeypatch:
     with pytest.raises(UserError, match="holds 2 trainings"):
         locate_checkpoint(output)
     assert find_run(output.parent / "latest") == output
+    evaluated: list[tuple[str, str]] = []
+    monkeypatch.setattr(evaluation, "evaluate_one", lambda cfg, name="": evaluated.append((str(cfg.checkpoint), name)))
+    evaluation.main(compose("evaluate", [f"checkpoint={output}", "tasks=StopCube"]))
+    assert evaluated == [(str(run), run.name) for run in trainings_in(output)]
     with pytest.raises(UserError, match="other settings"):
         command.main(compose("train", [*words, "train.lr=1e-5"]))
     (trainings_in(output)[1] / "summary.json").unlink()
