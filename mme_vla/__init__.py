@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mme_vla.memory.base import Memory, PerceptualMemory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
     from mme_vla.memory.recurrent import RecurrentMemory
+    from mme_vla.memory.transforms import HistoryTransform
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.episode import Episode
@@ -44,6 +45,7 @@ _MODULES = {
     "memory.base": ["Memory", "PerceptualMemory"],
     "memory.history": ["CachedHistory", "History", "OnlineHistory", "StorageSpec"],
     "memory.recurrent": ["RecurrentMemory"],
+    "memory.transforms": ["HistoryTransform"],
     "policy.base": ["Policy"],
     "policy.build": ["build_policy"],
     "policy.episode": ["Episode"],
@@ -58,9 +60,10 @@ _HOME = {name: f"mme_vla.{module}" for module, names in _MODULES.items() for nam
 
 __all__ = [
     "BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "Backbone", "Batch", "CachedHistory", "Embodiment",
-    "Episode", "History", "HistoryTokens", "Integration", "MMEPolicy", "Memory", "MemoryTokens", "OnlineHistory",
-    "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor", "Task", "UserError",
-    "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe", "register",
+    "Episode", "History", "HistoryTokens", "HistoryTransform", "Integration", "MMEPolicy", "Memory", "MemoryTokens",
+    "OnlineHistory", "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor", "Task",
+    "UserError", "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe",
+    "register",
 ]  # fmt: skip
 
 

@@ -153,10 +153,15 @@ PLAYERS: Registry[Any] = Registry(
 )
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REWARDS: Registry[Any] = Registry("reward", dict.fromkeys(("none", "sparse", "subtask"), "mme_vla.envs.subtasks"))
+HISTORY_TRANSFORMS: Registry[Any] = Registry(
+    "history transform",
+    dict.fromkeys(("repeat_frame", "speed", "drop_frames", "noise"), "mme_vla.memory.transforms"),
+)
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
     "intervention": INTERVENTIONS, "reward": REWARDS,
+    "history_transform": HISTORY_TRANSFORMS,
 }  # fmt: skip
 
 
@@ -165,7 +170,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe) or `reward`.
+            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe), `reward` or `history_transform`.
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

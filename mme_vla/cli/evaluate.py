@@ -30,7 +30,23 @@ SUBGOAL_MODES = ("inline", "background")
 
 @cli("evaluate")
 def main(cfg: DictConfig) -> None:
-    """Run the episodes that have no result yet."""
+    """Run the episodes that have no result yet; of a folder of trainings those of one training after the other."""
+    from mme_vla.policy.run_folders import find_run, trainings_in
+    from mme_vla.training.runs import check_finished
+
+    folder = None if cfg.checkpoint is None else find_run(Path(str(cfg.checkpoint)).expanduser())
+    trainings = [] if folder is None else trainings_in(folder)
+    check_finished(trainings)
+    for training in trainings:
+        one = cfg.copy()
+        one.checkpoint = str(training)
+        evaluate_one(one, training.name)
+    if not trainings:
+        evaluate_one(cfg)
+
+
+def evaluate_one(cfg: DictConfig, training: str = "") -> None:
+    """Run the episodes of one policy; `training` is the folder of its records in `output`."""
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
@@ -66,7 +82,7 @@ def main(cfg: DictConfig) -> None:
     facts = facts_of(policy, name, source, settings, predictor)
     if not settings.render:
         logger.warning("render=false: the policy sees black images; only the time of the simulation means anything")
-    output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
+    output = (default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()) / training
     count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
     logger.info("%s into %s%s", count, output, f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "")
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}

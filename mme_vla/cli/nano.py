@@ -1,5 +1,6 @@
 """`python -m mme_vla.nano task=VideoUnmask model=framesamp_modul`: from nothing to a page of results on two cores."""
 
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
 from mme_vla.config.composition import command_trees, config_dir, plain
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, require
 from mme_vla.utils import read_json, write_json
 
 if TYPE_CHECKING:
@@ -36,9 +37,11 @@ def with_settings(words: Sequence[str]) -> list[str]:
     """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more.
 
     `nano=null` does without it. `model=…` would be a choice for a tree that holds one model; here it names the first of
-    several.
+    several. `model=a,b` and `budget=4,16` are lists of one run, which shares demonstrations and has one table, without
+    the further models of the task's file. Other lists of values are sweeps of `--multirun`.
     """
-    words = [f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word for word in words]
+    words = _as_lists([f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word
+                       for word in words])  # fmt: skip
     if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
         return [word for word in words if word != "nano=null"]
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
@@ -46,6 +49,19 @@ def with_settings(words: Sequence[str]) -> list[str]:
     if task_file is None or not task_file.is_file() or any(word.startswith("nano=") for word in words):
         return list(words)
     return [f"nano={task_file.stem}", *words]
+
+
+def _as_lists(words: Sequence[str]) -> list[str]:
+    """The words with `with_memory=a,b` and `budget=4,16` as lists, without `--multirun` where nothing else is swept."""
+    lists = []
+    for word in words:
+        key, _, value = word.partition("=")
+        several = key in ("with_memory", "budget") and "," in value and not value.startswith("[")
+        lists.append(f"{key}=[{value}]" if several else word)
+    if any(word.startswith("with_memory=[") for word in lists) and not any(w.startswith("also=") for w in lists):
+        lists.append("also=[]")
+    swept = [word for word in lists if "," in re.sub(r"[\[{(].*[\]})]", "", word.partition("=")[2])]
+    return [word for word in lists if swept or lists == list(words) or word not in ("--multirun", "-m")]
 
 
 @cli("nano")
@@ -56,6 +72,10 @@ def command(cfg: DictConfig) -> None:
     config = plain(cfg)
     check_names(config["task"], "mme_vla", "waypoint", None, None)
     check_counts(config["demonstrations"])
+    require(
+        isinstance(config["trainings"], int) and config["trainings"] >= 1,
+        f"trainings={brief(config['trainings'])}: must be a whole number from 1 on.",
+    )
     require_simulator()
     run(config, command_trees()[1:])
 
@@ -69,22 +89,30 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
     from mme_vla.nano.evaluating import NAME as PLANNER
     from mme_vla.nano.evaluating import record_videos, run_episodes
-    from mme_vla.nano.fitting import compose_policy, train
+    from mme_vla.nano.fitting import compose_policy, train_all
     from mme_vla.nano.page import write_page
 
     folder = Path(config["output"])
     folder.mkdir(parents=True, exist_ok=True)
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
     words += config["overrides"]
-    models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
+    first = as_list(config["with_memory"])
+    models = list(dict.fromkeys([*first, *config["beside"], *config["also"]]))
     how = (config["memories"], words, extra_dirs, config["plugins"])
-    composed = {model: compose_policy(model, *how) for model in models}
-    render_for = [model for model in config["drawn_for"] if model not in composed]
+    composed: dict[str, dict[str, Any]] = {}
+    fewer: set[str] = set()  # rows that are evaluated on fewer episodes
+    for model in models:
+        for budget in as_list(config["budget"]):
+            each = compose_policy(model, *how, budget=budget)
+            row = model if budget is None or each["memory"] is None else f"{model}@{budget}"
+            composed[row] = each
+            fewer |= {row} if model in config["also"] else set()
+    render_for = [model for model in config["drawn_for"] if model not in models]
     minutes = _Minutes(folder / "minutes.json")
     with minutes.of("demonstrations"):
         others = [compose_policy(model, *how) for model in render_for]
         memories = [each["memory"] for each in (*composed.values(), *others)]
-        robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
+        robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
         execute = robot.action.execute
         choices = [FrameChoice(DECISIONS, memory, execute) for memory in [None, *filter(None, memories)]]
         files = record_all(config, folder / "demonstrations", choices, robot)
@@ -92,19 +120,23 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
         return folder / "demonstrations"
     records: dict[str, list[EpisodeRecord]] = {}
     videos: list[Path] = []
-    for model, each in composed.items():
-        with minutes.of(f"training {model}"):
-            checkpoint = train(each, config["train"], folder / model, files, config["learning"])
-        with minutes.of(f"evaluation {model}"):
-            records[model] = run_episodes(
-                checkpoint, folder / model / config["split"], config["task"], split=config["split"],
-                episodes=config["also_episodes" if model in config["also"] else "episodes"],
-                seeds=config["policy_seeds"], workers=config["workers"], max_steps=config["max_steps"],
-                shard=config["shard"],
-            )  # fmt: skip
-        if model == config["with_memory"] and config["films"] and config["shard"] is None:
+    for row, each in composed.items():
+        recipe = (config["train"], folder / row, files, config["learning"])
+        with minutes.of(f"training {row}"):
+            checkpoints = train_all(each, *recipe, trainings=config["trainings"])
+        with minutes.of(f"evaluation {row}"):
+            records[row] = []
+            for checkpoint in checkpoints:
+                records[row] += run_episodes(
+                    checkpoint, checkpoint.parent.parent / config["split"], config["task"], split=config["split"],
+                    episodes=config["also_episodes" if row in fewer else "episodes"],
+                    seeds=config["policy_seeds"], workers=config["workers"], max_steps=config["max_steps"],
+                    shard=config["shard"],
+                )  # fmt: skip
+        if row == next(iter(composed)) and config["films"] and config["shard"] is None:
             with minutes.of("films"):
-                videos = record_videos(checkpoint, folder / "films", records[model])
+                of_first = records[row][: len(records[row]) // len(checkpoints)]
+                videos = record_videos(checkpoints[0], folder / "films", of_first)
     if config["shard"] is not None:
         return folder
     if config["planner"]:
@@ -114,6 +146,11 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     page = write_page(folder, config, records, next(iter(blind), None), minutes.spent, videos)
     print(page)
     return page
+
+
+def as_list(value: Any) -> list[Any]:
+    """A value of a configuration that may be one or several."""
+    return list(value) if isinstance(value, list | tuple) else [value]
 
 
 def plan_all(config: Mapping[str, Any], folder: Path) -> "list[EpisodeRecord]":

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.cli.command import cli
 from mme_vla.config.composition import plain
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.utils import remove_drafts, write_atomically
 
 if TYPE_CHECKING:
@@ -33,17 +33,57 @@ def main(cfg: DictConfig) -> None:
         fresh = Path(HydraConfig.get().runtime.output_dir)
         named = any(word.startswith("output=") for word in HydraConfig.get().overrides.task)
     try:
-        train(cfg, config, fresh, begun, named)
+        if config["trainings"] == 1:
+            train(cfg, config, fresh, begun, named)
+        else:
+            train_several(cfg, fresh, config["trainings"])
     except UserError:
         with suppress(OSError):
             fresh.rmdir()  # Hydra made it; it stays if it holds anything
         raise
 
 
-def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, named: bool = True) -> Path:
+def train_several(cfg: DictConfig, folder: Path, count: Any) -> list[Path]:
+    """Train several policies by one recipe, with consecutive seeds, one after the other; their last checkpoints.
+
+    Each has a numbered folder in `folder`. Finished ones are left as they are, and one that was interrupted resumes.
+    All have the vision tower of the first, frozen or to begin with, and so one vision cache.
+
+    Raises:
+        UserError: a count below 1, or a training there by other settings.
+    """
+    from mme_vla.policy.run_folders import training_name
+    from mme_vla.training.runs import SUMMARY, open_run, unfinished_trainings
+
+    require(isinstance(count, int) and count >= 1, f"trainings={count!r}: must be a whole number from 1 on.")
+    if cfg.resume is not None:
+        folder = unfinished_trainings(folder, count) if cfg.resume == "auto" else Path(str(cfg.resume))
+    checkpoints = []
+    for number in range(count):
+        one, place = cfg.copy(), folder / training_name(number)
+        one.seed, one.output, one.resume = int(cfg.seed) + number, str(place), "auto"
+        config = plain(one)
+        run = open_run(place, "auto", config)
+        if (place / SUMMARY).is_file() and run.checkpoint is not None and run.step == config["train"]["steps"]:
+            checkpoints.append(run.checkpoint)
+            continue
+        print(f"training {number + 1} of {count}, seed {one.seed}, in {place}")
+        checkpoints.append(train(one, config, place, time.perf_counter(), tower_seed=int(cfg.seed)))
+    return checkpoints
+
+
+def train(
+    cfg: DictConfig,
+    config: dict[str, Any],
+    folder: Path,
+    begun: float,
+    named: bool = True,
+    tower_seed: int | None = None,
+) -> Path:
     """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
 
-    named: whether the user chose the folder's name; another run may have begun in the same second.
+    named: whether the user chose the folder's name; another run may have begun in the same second. tower_seed: of the
+    fresh vision tower, where it is not the training's own.
 
     Returns:
         The last checkpoint.
@@ -74,7 +114,7 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
         if run.folder != folder:
             with suppress(OSError):
                 folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
-        trainer = _train(cfg, config, run, settings, accelerator, begun)
+        trainer = _train(cfg, config, run, settings, accelerator, begun, tower_seed)
     if trainer.stopped_by is not None:
         raise SystemExit(128 + trainer.stopped_by)
     assert trainer.last_checkpoint is not None
@@ -82,15 +122,23 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
 
 
 def _train(
-    cfg: DictConfig, config: dict[str, Any], run: "Run", settings: "TrainSettings", accelerator: Any, begun: float
+    cfg: DictConfig,
+    config: dict[str, Any],
+    run: "Run",
+    settings: "TrainSettings",
+    accelerator: Any,
+    begun: float,
+    tower_seed: int | None,
 ) -> "Trainer":
     import torch
     from accelerate.utils import broadcast_object_list
 
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.capabilities import with_vision_memory
-    from mme_vla.policy.finetune import apply_finetuning, cast_frozen
+    from mme_vla.policy.finetune import apply_finetuning, cast_frozen, copy_tower
     from mme_vla.policy.tensor_files import take_memory
+    from mme_vla.policy.training_identity import KEY as TRAINING
+    from mme_vla.policy.training_identity import identify
     from mme_vla.training.checkpoint import check_disk, load_policy
     from mme_vla.training.data import check_frozen, prepare_data
     from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
@@ -107,6 +155,8 @@ def _train(
     init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
     with nullcontext() if holds else torch.device("meta"):
         policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
+        if run.checkpoint is None and init_from is None and tower_seed not in (None, config["seed"]) and holds:
+            copy_tower(build_from_config(cfg, seed=tower_seed), policy)
     check_frozen(policy, config["finetune"]["freeze_vision"])
     if init_from is not None and holds:
         line.say(start_from(policy, init_from))
@@ -131,6 +181,7 @@ def _train(
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
     config["data"]["content"] = data.content
+    policy.config[TRAINING] = identify(config, data.content)
     check_disk(run.folder, policy, settings.keep, sharded)
     validation, collate = None, policy.require_processor().collate
     if data.val is not None and settings.val_samples:
@@ -160,7 +211,7 @@ def cache_command() -> str:
     from hydra.core.hydra_config import HydraConfig
 
     overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
-    words = [word for word in overrides if not word.startswith(("resume=", "output="))]
+    words = [word for word in overrides if not word.startswith(("resume=", "output=", "trainings="))]
     if "--config-dir" in sys.argv[:-1]:
         words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
     return shlex.join(["mme-vla", "cache", *words])

@@ -14,10 +14,14 @@ from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
+from mme_vla.memory.history import History
+from mme_vla.memory.transforms import FrameMap, HistoryTransform, TransformedHistory, map_frames
 from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
 from mme_vla.processing.prompt import SubgoalText
+
+TRANSFORMS = 1  # The stream of random numbers of an item that transforms read
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         jitter: bool = False,
         subgoal: SubgoalText | None = None,
         seed: int = 42,
+        transforms: Sequence[HistoryTransform] = (),
     ) -> None:
         """Arrange the samples; nothing is read yet.
 
@@ -78,6 +83,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
             seed: of all randomness.
+            transforms: of the frames of an episode, before anything reads its past.
         """
         require(
             memory is None or (caches is not None and len(caches) == len(sources)),
@@ -103,6 +109,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
+        self.transforms = tuple(transforms)
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(selected)]).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
@@ -177,42 +184,69 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             recorded=recorded,
         )
 
-    def past_actions(self, step: Step) -> np.ndarray:
+    def past_actions(self, step: Step, frames: FrameMap | None = None) -> np.ndarray:
         """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and there are."""
-        most = self.processor.prompt_spec.past_actions
-        return self.sources[step.source].past_actions(step.episode, step.index, most, self.action_offset)
+        source, most = self.sources[step.source], self.processor.prompt_spec.past_actions
+        if frames is None or source.robot.action.frames is None:
+            return source.past_actions(step.episode, step.index, most, self.action_offset)
+        now = int(frames.transformed(np.array(step.index)))
+        rows = frames.real[max(frames.exec_start, now - most) : now] + self.action_offset
+        if not len(rows):
+            return source.past_actions(step.episode, step.index, 0, self.action_offset)
+        return source.actions(step.episode, int(rows[0]), int(rows[-1]) + 1)[rows - rows[0]]
 
     def observation(self, index: int) -> dict[str, Any]:
-        """Return the item whose last step is `index`, as it would be met when acting."""
-        return self[index]
+        """Return the item whose last step is `index`, as it would be met when acting: without transforms."""
+        return self._item(index, ())
 
     def __getitem__(self, index: int) -> dict[str, Any]:
+        return self._item(index, self.transforms)
+
+    def _item(self, index: int, transforms: Sequence[HistoryTransform]) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        return self.inputs_at(step, rng) | {
+        frames = self._frame_map(step.source, step.episode, np.array([step.index]), index, transforms)
+        return self.inputs_at(step, rng, frames) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
             "place": (step.source, step.episode, step.index),
         }
 
-    def inputs_at(self, step: Step, rng: np.random.Generator) -> dict[str, Any]:
-        """What the network reads and learns of a step, with what its memory selects: its `history` and `past`."""
+    def _frame_map(
+        self, source: int, episode: int, kept: np.ndarray, index: int, transforms: Sequence[HistoryTransform]
+    ) -> FrameMap | None:
+        """How transforms show an item's episode up to the last of the `kept` frames; None without transforms."""
+        if not transforms:
+            return None
+        rng = np.random.default_rng([self.seed, self.epoch, index, TRANSFORMS])
+        exec_start = int(self.sources[source].exec_starts[episode])
+        return map_frames(transforms, int(kept[-1]) + 1, exec_start, rng, keep=kept)
+
+    def inputs_at(self, step: Step, rng: np.random.Generator, frames: FrameMap | None = None) -> dict[str, Any]:
+        """What the network reads and learns of a step, with what its memory selects: its `history` and `past`.
+
+        frames: the map of a transformed episode; all that is read of the past goes through it.
+        """
+        now = step.index if frames is None else int(frames.transformed(np.array(step.index)))
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
-        item = self.processor.item(self._sample(step, subgoal))
+        item = self.processor.item(self._sample(step, subgoal, now, frames))
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
         if self.memory is not None:
-            history = self.caches[step.source].history(step.episode)
+            history: History = self.caches[step.source].history(step.episode)
             if uses_proprio(self.memory):
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
-            item["history"] = self.memory.gather_selection(history, step.index, rng if self.jitter else None)
+            if frames is not None:
+                history = TransformedHistory(history, frames)
+            item["history"] = self.memory.gather_selection(history, now, rng if self.jitter else None)
             if (spec := past_view_spec(self.memory)) is not None:
-                read = partial(self._images, step.source, step.episode)
-                item["past"] = past_views(spec, step.index, read, self.processor.images)
+                read = partial(self._images, step.source, step.episode, frames)
+                item["past"] = past_views(spec, now, read, self.processor.images)
         return item
 
-    def _images(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:
+    def _images(self, source: int, episode: int, shown: FrameMap | None, frames: np.ndarray) -> list[np.ndarray]:
+        frames = frames if shown is None else shown.real[frames]
         return [self.sources[source].frames(episode, frames, name) for name in self._cameras]
 
     @property
@@ -222,10 +256,11 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
         return motion_rows(self.processor, *self.sources[source].robot_motion(episode, frames, self.action_offset))
 
-    def _sample(self, step: Step, subgoal: str | None) -> Sample:
+    def _sample(self, step: Step, subgoal: str | None, now: int, frames: FrameMap | None) -> Sample:
         """A step with the frames of its window; before the episode's first frame that one is repeated."""
         source, cameras = self.sources[step.source], self._cameras
-        window = np.arange(step.index - self.processor.samples.window + 1, step.index + 1).clip(min=0)
+        window = np.arange(now - self.processor.samples.window + 1, now + 1).clip(min=0)
+        window = window if frames is None else frames.real[window]
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
         history, memory_camera = self.processor.samples.history, source.robot.memory_camera
@@ -239,7 +274,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             states=states[window - first],
             goal=source.robot.action.worded(step.goal, source.options(step.episode)),
             subgoal=subgoal,
-            past_actions=self.past_actions(step),
+            past_actions=self.past_actions(step, frames),
             actions=step.actions,
         )
 
@@ -276,7 +311,7 @@ class GroupDataset(TrainingDataset):
             frames = np.sort(rng.choice(length, size, replace=False))
         else:
             frames = np.minimum(np.arange(size), length - 1)
-        return self._group(s, episode, frames, rng)
+        return self._group(s, episode, frames, rng, self._frame_map(s, episode, frames, index, self.transforms))
 
     def observation(self, index: int) -> dict[str, Any]:
         """The group that ends at a step: the moments before it at which the policy would have been asked."""
@@ -285,11 +320,13 @@ class GroupDataset(TrainingDataset):
         frames = np.arange(frame, -1, -stride)[: self.processor.samples.group_size][::-1]
         return self._group(s, episode, frames, np.random.default_rng([self.seed, self.epoch, index]))
 
-    def _group(self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
+    def _group(
+        self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator, shown: FrameMap | None = None
+    ) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
         return {
-            "moments": [self.inputs_at(step, rng) for step in steps],
-            "times": frames.astype(np.int64),
+            "moments": [self.inputs_at(step, rng, shown) for step in steps],
+            "times": (frames if shown is None else shown.transformed(frames)).astype(np.int64),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,
             "place": (s, episode, int(frames[-1])),

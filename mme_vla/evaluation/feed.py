@@ -1,4 +1,4 @@
-"""Frames on their way from an environment to a policy: other episodes first, no video, or a frame that is repeated."""
+"""Frames on their way from an environment to a policy: other episodes first, no video, or frames transformed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from mme_vla.envs.metadata import SESSIONS, read_variant
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.transforms import HistoryTransform, map_frames
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, frames_read, with_vision_memory
 from mme_vla.policy.episode import Episode, Host
@@ -23,18 +24,31 @@ class Feed:
     """Changes which frames of an episode a policy observes. The default changes nothing.
 
     sessions: unrelated episodes that come first, as part of the conditioning video. video: whether the conditioning
-    video is shown. stills: how often one frame is repeated; at: which, counted from the first execution frame.
+    video is shown. transforms: of the frames, those that training applies, in this order.
     """
 
     sessions: int = 0
     video: bool = True
-    stills: int = 0
-    at: int = 0
+    transforms: tuple[HistoryTransform, ...] = ()
+
+    @property
+    def drops(self) -> bool:
+        """Whether frames of the execution may be left out."""
+        return any(transform.drops for transform in self.transforms)
 
     def repeats(self, frames: np.ndarray, exec_start: int) -> np.ndarray:
         """How often each of the episode's frames [n] is observed, int64 [n]."""
-        shown = np.where((frames < exec_start) & (not self.video), 0, 1)
-        return shown + self.stills * (frames == exec_start + self.at)
+        frames = np.asarray(frames, np.int64)
+        if not len(frames):
+            return np.zeros(0, np.int64)
+        return self._counts(int(frames.max()) + 1, exec_start)[frames]
+
+    def _counts(self, length: int, exec_start: int) -> np.ndarray:
+        """How often each of the first `length` frames is observed."""
+        real = map_frames(self.transforms, length, exec_start).real
+        counts = np.bincount(real, minlength=length)
+        counts[:exec_start] *= self.video
+        return counts
 
     def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
         """The episode's frames [n] as numbers of observed frames, int64 [n]; −1 for one that is left out.
@@ -42,23 +56,24 @@ class Feed:
         exec_start: the episode's first execution frame. before: frames of the sessions.
         """
         frames = np.asarray(frames, np.int64)
-        video = exec_start if self.video else 0
-        later = np.where(frames >= exec_start + self.at, self.stills, 0)  # of a repeated frame: its last repeat
-        executed = before + video + frames - exec_start + later
-        return np.where(frames >= exec_start, executed, before + frames if self.video else -1)
+        counts = self._counts(int(frames.max(initial=0)) + 1, exec_start)
+        last = before + np.cumsum(counts)[frames] - 1  # of a repeated frame: its last repeat
+        return np.where(counts[frames] > 0, last, -1)
 
     def first_executed(self, exec_start: int, before: int = 0) -> int:
         """The number of the first execution frame among the observed ones."""
-        return before + (exec_start if self.video else 0)
+        return before + int(self._counts(exec_start, exec_start).sum())
 
     def source_frames(self, displayed: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
         """The episode's frames behind observed ones [m], ascending, each once; those of sessions are left out."""
         displayed = np.asarray(displayed, np.int64) - before
         displayed = displayed[displayed >= 0]
-        video = exec_start if self.video else 0
-        past = displayed - video
-        executed = np.where(past > self.at, np.maximum(past - self.stills, self.at), past)
-        return np.unique(np.where(displayed < video, displayed, exec_start + executed))
+        if not len(displayed):
+            return displayed
+        length = exec_start + int(displayed.max()) + 1
+        while (counts := self._counts(length, exec_start)).sum() <= displayed.max():
+            length *= 2
+        return np.unique(np.repeat(np.arange(length), counts)[displayed])
 
 
 class FeedHost(Host, Protocol):
@@ -84,6 +99,8 @@ class FedEpisode(Episode):
         self._host, self.seed = host, seed
         self.inner = host.inner.start_episode(goal, seed)
         self.exec_start: int | None = None
+        self._counts: np.ndarray = np.zeros(0, np.int64)
+        self._starts: np.ndarray = np.zeros(0, np.int64)
         self.boundaries: Sequence[int] = ()
 
     def observe(
@@ -107,6 +124,9 @@ class FedEpisode(Episode):
         repeats = self._host.feed.repeats(
             numbers, self.n_observed_frames if self.exec_start is None else self.exec_start
         )
+        if self._host.feed.drops and len(repeats) and video < len(states):
+            repeats[-1] = max(repeats[-1], 1)  # the frame at which the policy decides
+        self._counts = np.concatenate([self._counts, repeats])
         order = np.repeat(np.arange(len(states)), repeats)
         executed = order[order >= video]
         if actions is not None:
@@ -119,6 +139,8 @@ class FedEpisode(Episode):
             views[name] = view if (repeats == 1).all() else view[np.searchsorted(at, order[places[name]])]
         shown = {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
         self.inner.observe(views, states[order], demo[order], actions, **shown)
+        if len(self._starts):
+            self.boundaries = self.numbers(self._starts)
 
     def _observe_sessions(self) -> None:
         stored, before = stored_frames(self._host.inner, self._host.before), 0
@@ -129,9 +151,14 @@ class FedEpisode(Episode):
 
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
         """Note where sub-tasks began, the execution among them, as numbers of observed frames."""
-        starts = np.array(sorted({0, exec_start, *frames}), np.int64)
-        displayed = self._host.feed.displayed(starts, exec_start, self._host.before)
-        self.boundaries = [int(frame) for frame in displayed if frame >= 0]
+        self._starts = np.array(sorted({0, exec_start, *frames}), np.int64)
+        self.boundaries = self.numbers(self._starts)
+
+    def numbers(self, frames: np.ndarray) -> list[int]:
+        """The episode's frames [n] as numbers of observed frames, without those that are not observed."""
+        frames = frames[frames < len(self._counts)]
+        last = self._host.before + np.cumsum(self._counts)[frames] - 1
+        return [int(number) for number, count in zip(last, self._counts[frames], strict=True) if count]
 
     @property
     def state(self) -> Tensor:
@@ -193,13 +220,15 @@ class FedPolicy(Policy):
         return with_vision_memory(self.inner).encode_frames(frames)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """The episode's frames that the policy reads through the feed."""
+        """The episode's frames that the policy reads through the feed; None for all, where the feed leaves some out."""
+        if self.feed.drops:
+            return None
         displayed = self.feed.displayed(steps, exec_start, self.before)
         reads = frames_read(self.inner, displayed, self.feed.first_executed(exec_start, self.before))
         if reads is None:
             return None
-        paused = [exec_start + self.feed.at] if self.feed.stills else []
-        return np.union1d(self.feed.source_frames(reads, exec_start, self.before), np.array(paused, np.int64))
+        paused = np.flatnonzero(self.feed.repeats(np.arange(int(max(steps, default=-1)) + 1), exec_start) > 1)
+        return np.union1d(self.feed.source_frames(reads, exec_start, self.before), paused)
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         inner = [inner_episode(episode) for episode in episodes]

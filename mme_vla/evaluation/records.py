@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
 from mme_vla.errors import UserError, check_choice, require
+from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import parse_json, to_line, verified
 
 Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
@@ -15,7 +16,7 @@ OUTCOMES = ("success", "fail", "timeout", "error")
 
 
 class RunKey(NamedTuple):
-    """What one pass over the benchmark is a pass of: one policy, one checkpoint, one model seed."""
+    """What one pass over the benchmark is a pass of: one policy, one training, one checkpoint, one model seed."""
 
     model: str
     subgoal: str | None
@@ -24,11 +25,15 @@ class RunKey(NamedTuple):
     model_seed: int
     split: str
     composition: str | None = None
+    training: TrainingIdentity | None = None
 
     def __str__(self) -> str:
         name = self.model if self.subgoal is None else f"{self.model}+{self.subgoal}"
         name = name if self.memory_budget is None else f"{name}, {self.memory_budget} memory tokens"
-        return f"{name}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
+        trained = ""
+        if self.training is not None:
+            trained = f", training seed {self.training.seed} of recipe {str(self.training.recipe)[:6]}"
+        return f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
 
 
 class EpisodeKey(NamedTuple):
@@ -65,6 +70,8 @@ class EpisodeRecord:
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
     composition: `composition_digest` (policy/saving.py) of the policy, so that no two configurations are averaged
         under one name; None in records written before there was one, and of players that are no policy of this library.
+    training: seed, recipe, data and weights of the training that the checkpoint is of; None in records written before
+        checkpoints named it, and of what was not trained.
     extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.
     """
@@ -86,6 +93,7 @@ class EpisodeRecord:
     subgoal: str | None = None
     memory_budget: Whole | None = None
     composition: str | None = None
+    training: TrainingIdentity | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -100,7 +108,7 @@ class EpisodeRecord:
     @property
     def run(self) -> RunKey:
         return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split,
-                      self.composition)  # fmt: skip
+                      self.composition, self.training)  # fmt: skip
 
     @property
     def key(self) -> EpisodeKey:

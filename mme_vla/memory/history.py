@@ -129,6 +129,11 @@ class History:
     def scores(self) -> FrameScores:
         raise NotImplementedError
 
+    @property
+    def stored_frames(self) -> np.ndarray:
+        """The frames that have tokens, int64 [m], ascending."""
+        raise NotImplementedError
+
     def gather(self, indices: np.ndarray) -> Tensor:
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch)."""
         raise NotImplementedError
@@ -188,6 +193,10 @@ class CachedHistory(History):
     def scores(self) -> FrameScores:
         return self._scores
 
+    @property
+    def stored_frames(self) -> np.ndarray:
+        return self._stored_frames
+
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._row_of(indices[:, 0], self._stored_frames)
         picked = torch.from_numpy(np.ascontiguousarray(self._tokens[rows, indices[:, 1]]))
@@ -215,6 +224,10 @@ class OnlineHistory(History):
     @property
     def scores(self) -> FrameScores:
         return FrameScores(self._scores.frames[: self._scored], self._scores.values[: self._scored])
+
+    @property
+    def stored_frames(self) -> np.ndarray:
+        return np.asarray(self._stored_frames, np.int64)
 
     def to_encode(self, count: int, rendered: np.ndarray | None = None) -> np.ndarray:
         """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`.
@@ -306,6 +319,10 @@ class PromptConditionedHistory(History):
     @property
     def scores(self) -> FrameScores:
         return self._source.scores
+
+    @property
+    def stored_frames(self) -> np.ndarray:
+        return self._source.stored_frames
 
     def gather(self, indices: np.ndarray) -> Tensor:
         return self._condition(self._source.gather(indices))

@@ -184,6 +184,10 @@ class CoarserHistory(History):
         rows = scores.values.reshape(-1, fine, fine)[:, :: fine // grid, :: fine // grid]
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
 
+    @property
+    def stored_frames(self) -> np.ndarray:
+        return self._stored.stored_frames
+
     def gather(self, indices: np.ndarray) -> Tensor:
         return self._pooled(indices, self._stored.gather)
 

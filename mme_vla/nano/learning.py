@@ -1,7 +1,7 @@
 """Training on demonstrations of planned motions: every decision is a sample, and its tokens are computed beforehand."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from torch.utils.data import Dataset
 from mme_vla.errors import require
 from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
+from mme_vla.memory.transforms import HistoryTransform, TransformedHistory, map_frames
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import motion_rows
@@ -56,9 +57,37 @@ class SparseHistory(History):
     def scores(self) -> FrameScores:
         return self._scores
 
+    @property
+    def stored_frames(self) -> np.ndarray:
+        return self._frames
+
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._row_of(indices[:, 0], self._frames)
         return self._tokens[torch.as_tensor(rows), torch.as_tensor(indices[:, 1])]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a memory selects from in a demonstration whose frames are transformed, anew in each epoch.
+
+    rows: for each decision its history and its frame.
+    """
+
+    memory: Memory
+    rows: Sequence[tuple[History, int]]
+    transforms: Sequence[HistoryTransform]
+    seed: int
+
+    def select(self, rows: Sequence[int], epoch: int) -> HistoryTokens:
+        """The selections of these decisions, each a function of (seed, epoch, row)."""
+        items = []
+        for row in rows:
+            history, frame = self.rows[row]
+            rng = np.random.default_rng([self.seed, epoch, row])
+            shown = map_frames(self.transforms, frame + 1, history.exec_start, rng, keep=[frame])
+            now = int(shown.transformed(np.array(frame)))
+            items.append(self.memory.gather_selection(TransformedHistory(history, shown), now))
+        return stack_history(items)
 
 
 class Decisions(Dataset[int]):
@@ -71,11 +100,21 @@ class Decisions(Dataset[int]):
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
         to each number of a token and, `JOINT_NOISE` of it, to each joint (radians).
     token_noise: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
+    replay: selects the history of a decision anew in each epoch, where transforms change the demonstrations' frames.
     """
 
+    epoch = 0
+
     def __init__(
-        self, batch: Batch, distant: Tensor, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0
+        self,
+        batch: Batch,
+        distant: Tensor,
+        oversample: int = 1,
+        noise: float = 0.0,
+        token_noise: float = 0.0,
+        replay: Replay | None = None,
     ) -> None:
+        self.replay = replay
         self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, oversample, 1))
 
@@ -88,19 +127,27 @@ class Decisions(Dataset[int]):
         min_distance: float = MIN_DISTANCE,
         noise: float = 0.0,
         token_noise: float = 0.0,
+        transforms: Sequence[HistoryTransform] = (),
+        seed: int = 0,
     ) -> "Decisions":
         """Make all tokens, of one demonstration after the other: their images together are gigabytes.
 
         policy: with the vision weights it trains with, and statistics. min_distance: metres from which on a motion
-        leads to another place. The others: see the class.
+        leads to another place. transforms: of a demonstration's frames, chosen by `seed` and epoch. The others: see the
+        class.
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
+        rows: list[tuple[History, int]] = []
         for demonstration in demonstrations:
-            items += _items(policy, demonstration)
+            history = _history(policy, demonstration)
+            items += _items(policy, demonstration, history)
+            if history is not None and transforms:
+                rows += [(history, frame) for frame in _decisions(policy, demonstration)]
             distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
         require(items, "The demonstrations hold no decision to learn from.")
-        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise)
+        replay = Replay(policy.require_memory(), rows, transforms, seed) if rows else None
+        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise, replay)
 
     @classmethod
     def load(cls, path: Path, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0) -> "Decisions":
@@ -132,10 +179,16 @@ class Decisions(Dataset[int]):
     def __getitem__(self, index: int) -> int:
         return int(self._rows[index])
 
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, which transforms depend on."""
+        self.epoch = epoch
+
     def collate(self, rows: Sequence[int]) -> Batch:
         """The batch of these decisions."""
         indices = torch.as_tensor(list(rows))
         batch = self.batch.rows(indices)
+        if self.replay is not None:
+            batch = replace(batch, history=self.replay.select(rows, self.epoch))
         return self._noisy(batch, rows) if self.noise or self.token_noise else batch
 
     def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
@@ -200,13 +253,12 @@ def _widened(stats: QuantileStats) -> QuantileStats:
 
 
 @torch.no_grad()
-def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, Any]]:
+def _items(policy: MMEPolicy, demonstration: Demonstration, history: History | None) -> list[dict[str, Any]]:
     processor, cameras = policy.require_processor(), policy.embodiment.camera_names
-    decisions = [int(frame) for frame in demonstration.motions.decisions[:: policy.embodiment.action.execute]]
+    decisions = _decisions(policy, demonstration)
     views = processor.images([np.stack([demonstration.images[name][frame] for frame in decisions]) for name in cameras])
     flat = views.flatten(0, 1).float() / 255 * 2 - 1
     view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
-    history = _history(policy, demonstration)
     subgoals = _subgoals(policy, demonstration)[:: policy.embodiment.action.execute]
     items = []
     for place, frame in enumerate(decisions):
@@ -224,6 +276,11 @@ def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, An
     return items
 
 
+def _decisions(policy: MMEPolicy, demonstration: Demonstration) -> list[int]:
+    return [int(frame) for frame in demonstration.motions.decisions[:: policy.embodiment.action.execute]]
+
+
+@torch.no_grad()
 def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
     if policy.memory is None:
         return None

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, wilson
+from mme_vla.evaluation.results.aggregate import Interval, Method, Results, aggregate, wilson
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.nano.evaluating import NAME as PLANNER
-from mme_vla.nano.fitting import DONE, learning_curve
+from mme_vla.nano.fitting import DONE, learning_curve, training_folders
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
 
@@ -34,9 +34,16 @@ def write_page(
     all others are compared with. minutes: of each stage, on the clock and of processors. videos: one of a success, one
     of a failure, as far as there are such.
     """
-    trained = [model for model in records if model != PLANNER]
+    runs = {
+        model: training_folders(folder / model, config.get("trainings", 1)) for model in records if model != PLANNER
+    }
+    ends = {model: [read_json(run / DONE, "a training's end") for run in folders] for model, folders in runs.items()}
     results, comparisons = compared(records, config["task"], config["split"], without)
-    plot_curves({model: learning_curve(folder / model) for model in trained}, folder / CURVES)
+    curves = {
+        model if len(folders) == 1 else f"{model}, {run.name}": learning_curve(run)
+        for model, folders in runs.items() for run in folders
+    }  # fmt: skip
+    plot_curves(curves, folder / CURVES)
     text = render(
         "nano.md",
         config=config,
@@ -44,7 +51,7 @@ def write_page(
         seeds=", ".join(map(str, config["policy_seeds"])),
         planner=PLANNER,
         without=without,
-        success=success_table(records, {m: read_json(folder / m / DONE, "a training's end") for m in trained}),
+        success=success_table(records, ends, results),
         comparison=to_markdown(comparison_table(comparisons)) if comparisons else "",
         verdicts=[comparison.verdict for comparison in comparisons],
         notes=results.notes,
@@ -80,10 +87,15 @@ def _method(results: Results, record: EpisodeRecord) -> Method:
     return next(method for method in results.methods if any(run.key == record.run for run in method.runs))
 
 
-def success_table(records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[str, Mapping[str, Any]]) -> str:
+def success_table(
+    records: Mapping[str, Sequence[EpisodeRecord]],
+    ends: Mapping[str, Sequence[Mapping[str, Any]]],
+    results: Results,
+) -> str:
     """Success of each model, in all and by difficulty: won / run, and Wilson's interval of the distinct episodes.
 
-    ends: of each trained model, what `train` wrote: how far off its held-out decisions to go elsewhere were.
+    Of several trainings: their mean ± deviation, and the interval over episodes and trainings. ends: of each trained
+    model, what each training wrote: how far off its held-out decisions to go elsewhere were.
     """
     columns = ("memory tokens", "all", "95 % interval", *LEVELS, "off by, held out", "within 2 cm")
     lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]
@@ -92,9 +104,13 @@ def success_table(records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[
         interval = wilson(rate, episodes)
         levels = [[record for record in model_records if record.difficulty == level] for level in LEVELS]
         cells = [f"{_won(part)}/{len(part)}" if part else "" for part in (model_records, *levels)]
-        success = f"{100 * rate:.0f} % ({cells[0]})"
+        deviation = ""
+        average = _method(results, model_records[0]).average
+        if len(ends.get(model, ())) > 1 and average.std is not None and average.interval is not None:
+            deviation, interval = f" ± {average.std:.0f}", Interval(*(value / 100 for value in average.interval))
+        success = f"{100 * rate:.0f}{deviation} % ({cells[0]})"
         confidence = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
-        off = np.array(ends[model]["off_by_m"]) if model in ends else None
+        off = np.concatenate([end["off_by_m"] for end in ends[model]]) if model in ends else None
         errors = ("", "") if off is None else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
         row = (model_records[0].model, model_records[0].memory_budget or "", success, confidence, *cells[1:], *errors)
         lines.append("| " + " | ".join(map(str, row)) + " |")

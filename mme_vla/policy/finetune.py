@@ -109,6 +109,19 @@ def apply_finetuning(
     return counts
 
 
+def copy_tower(source: "Policy", policy: "Policy") -> None:
+    """Give a policy the vision tower of another of the same composition."""
+    of_vision = {name: value for name, value in source.named_parameters() if _is_vision(source, name)}
+    with torch.no_grad():
+        for name, value in policy.named_parameters():
+            if name in of_vision:
+                value.copy_(of_vision[name])
+
+
+def _is_vision(policy: "Policy", name: str) -> bool:
+    return policy.finetune_spec.component_of(name) == "vision"
+
+
 def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
     """Make sure that a policy can compute with frozen weights of this dtype (None: as they are)."""
     if name is None:

@@ -29,6 +29,27 @@ def step_of(checkpoint: Path) -> int:
     return int(match[1]) if match else -1
 
 
+_TRAINING = re.compile(r"training_(\d+)")
+
+
+def training_name(number: int) -> str:
+    """The folder name of one of several trainings of one recipe, counted from 0."""
+    return f"training_{number}"
+
+
+def trainings_in(folder: Path) -> list[Path]:
+    """The run folders of the trainings of one recipe in `folder` that wrote a checkpoint, in their order."""
+    runs = [path for path in folder.glob("training_*") if _TRAINING.fullmatch(path.name)]
+    runs = [path for path in runs if checkpoints_in(path / CHECKPOINTS)]
+    return sorted(runs, key=lambda path: int(path.name.removeprefix("training_")))
+
+
+def newest_write(run: Path) -> int:
+    """When a run, or one of its trainings, wrote a checkpoint last, in nanoseconds; 0 without a checkpoint."""
+    written = [checkpoints_in(one / CHECKPOINTS) for one in (run, *trainings_in(run))]
+    return max((checkpoints[-1].stat().st_mtime_ns for checkpoints in written if checkpoints), default=0)
+
+
 LATEST = "latest"
 """`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
 SHIPPED = "nano"
@@ -46,9 +67,9 @@ def find_run(path: Path) -> Path:
         return Path(str(files("mme_vla").joinpath("assets", SHIPPED)))
     if path.name != LATEST:
         return path
-    runs = [run for run in path.parent.glob("*") if checkpoints_in(run / CHECKPOINTS)]
+    runs = [run for run in path.parent.glob("*") if newest_write(run)]
     require(runs, f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another.")
-    return max(runs, key=lambda run: (checkpoints_in(run / CHECKPOINTS)[-1].stat().st_mtime_ns, run.name))
+    return max(runs, key=lambda run: (newest_write(run), run.name))
 
 
 def resolve_checkpoint(path: Path) -> Path:
@@ -59,6 +80,11 @@ def resolve_checkpoint(path: Path) -> Path:
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():
         return newest
+    if trainings := trainings_in(path):
+        raise UserError(
+            f"{path} holds {len(trainings)} trainings of one recipe: name one of them, such as {trainings[0]}. "
+            "mme-vla evaluate and results take all of them."
+        )
     if _is_released(path):
         raise UserError(
             f"{path} is a checkpoint of the released code, in another format. Convert it, then name the new folder: "

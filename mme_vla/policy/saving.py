@@ -22,6 +22,8 @@ from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
 from mme_vla.policy.tensor_files import assign_tensors, dtype_of, list_weight_files, load_tensors, save_tensors
+from mme_vla.policy.training_identity import KEY as TRAINING
+from mme_vla.policy.training_identity import weights_digest
 from mme_vla.registry import POLICIES
 from mme_vla.utils import check_sums, inside, read_json, write_sums
 
@@ -228,6 +230,8 @@ def load_policy[P: "Policy"](
     target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
     require((folder / CONFIG).is_file(), f"No policy at {source}: it lacks {CONFIG}, which save_pretrained() writes.")
     config = read_config(folder)
+    if isinstance(config.get(TRAINING), dict):
+        config[TRAINING] = {**config[TRAINING], "weights": weights_digest(folder)}
     require(
         "backbone" in config,
         f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "

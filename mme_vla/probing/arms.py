@@ -1,5 +1,6 @@
 """Arms of a probe: interventions alone or together (`drop:2`, `nodemo+shuffle`)."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from functools import reduce
@@ -10,11 +11,13 @@ import numpy as np
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief, require
 from mme_vla.evaluation.feed import Feed
+from mme_vla.memory.transforms import build_transform
 from mme_vla.policy.base import Policy
 from mme_vla.probing.channels import Channel, Remembered
-from mme_vla.probing.interventions import NEEDS, Intervention, Moment
-from mme_vla.registry import INTERVENTIONS
+from mme_vla.probing.interventions import NEEDS, Intervention, Moment, Transform
+from mme_vla.registry import HISTORY_TRANSFORMS, INTERVENTIONS
 
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 DEFAULT_ARMS = (
     "drop:all", "nodemo", "swap", "shuffle", "recent", "oracle", "delay:16", "delay:64", "delay:256", "pause",
     "distract:1", "distract:3", "subgoal_swap", "subgoal_delay", "subgoal_count",
@@ -64,7 +67,8 @@ class Arm:
         """Where the arm stands on its dial, if it is one intervention with a number for one."""
         if len(self.parts) != 1 or self.parts[0].dial is None:
             return None
-        value = getattr(self.parts[0], self.parts[0].dial)
+        part = self.parts[0]
+        value = getattr(part.transform if isinstance(part, Transform) else part, self.parts[0].dial)
         return float(value) if isinstance(value, int | float) else None
 
 
@@ -83,17 +87,26 @@ def read_arm(spec: Any) -> Arm:
 
 def _read_part(word: str) -> Intervention:
     name, _, value = word.partition(":")
-    dial = INTERVENTIONS[name].dial
+    dial = _kind(name).dial
     if not value:
         return _build({"name": name})
+    if name in HISTORY_TRANSFORMS and dial is not None and _NUMBER.fullmatch(value):
+        return _build({"name": name, dial: float(value) if "." in value else int(value)})
     if dial is None or (value != "all" and not value.removeprefix("-").isdecimal()):
         allowed = f"{name}:<{dial}>, a whole number, or all where it counts" if dial else f"{name}, which has no dial"
         raise UserError(f"{word!r}: write {allowed}.")
     return _build({"name": name, dial: None if value == "all" else int(value)})
 
 
+def _kind(name: Any) -> Any:
+    """The class of an intervention, or of a history transform, which a probe applies as well."""
+    return (HISTORY_TRANSFORMS if name in HISTORY_TRANSFORMS else INTERVENTIONS)[name]
+
+
 def _build(section: Mapping[str, Any]) -> Intervention:
-    entry: Any = INTERVENTIONS[section.get("name")]  # type: ignore[index]
+    entry: Any = _kind(section.get("name"))
+    if section.get("name") in HISTORY_TRANSFORMS:
+        return Transform(build_transform(dict(section)))
     options = {key: value for key, value in section.items() if key != "name"}
     if not is_dataclass(entry):
         return INTERVENTIONS.build(section)
@@ -151,7 +164,8 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
-    return [{"intervention": type(part).__name__, **vars(part)} for part in arm.parts]
+    parts = [part.transform if isinstance(part, Transform) else part for part in arm.parts]
+    return [{"intervention": type(part).__name__, **vars(part)} for part in parts]
 
 
 def slug(name: str) -> str:

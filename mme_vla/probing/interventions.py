@@ -9,10 +9,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+from torch import Tensor
 
 from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.errors import UserError
 from mme_vla.evaluation.feed import Feed
+from mme_vla.memory.history import History
+from mme_vla.memory.transforms import HistoryTransform, RepeatFrame
 from mme_vla.probing.channels import Remembered, same_progress
 from mme_vla.registry import INTERVENTIONS
 
@@ -183,7 +186,7 @@ class Oracle(Intervention):
 @INTERVENTIONS.register("pause")
 @dataclass(frozen=True)
 class Pause(Intervention):
-    """One frame is repeated `frames` times more. `at`: which, from the first execution frame on."""
+    """One frame is repeated `frames` times more: `repeat_frame`. `at`: which, from the first execution frame on."""
 
     frames: NonNegativeInt = 64
     at: NonNegativeInt = 0
@@ -191,7 +194,55 @@ class Pause(Intervention):
     needs: ClassVar = frozenset({"pauses"})
 
     def feed(self, feed: Feed) -> Feed:
-        return replace(feed, stills=feed.stills + self.frames, at=self.at)
+        return replace(feed, transforms=(*feed.transforms, RepeatFrame(self.frames, self.at)))
+
+
+@dataclass(frozen=True)
+class Transform(Intervention):
+    """A history transform (`mme_vla.memory.transforms`), as training applies it, on the frames of a running episode."""
+
+    transform: HistoryTransform
+
+    @property
+    def dial(self) -> str | None:  # type: ignore[override]
+        return self.transform.dial
+
+    @property
+    def needs(self) -> frozenset[str]:  # type: ignore[override]
+        changes = type(self.transform).perturb is not HistoryTransform.perturb
+        return frozenset({"entries"} if changes else {"pauses"})
+
+    def feed(self, feed: Feed) -> Feed:
+        return replace(feed, transforms=(*feed.transforms, self.transform))
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        if "entries" not in self.needs:
+            return store
+        slots = store.occupied
+        views: dict[int, _Perturbed] = {}
+        contents: list[Any] = []
+        for content in (_content(store, slot) for slot in slots):
+            if isinstance(content, Tensor):
+                rows = self.transform.perturb(content.reshape(-1, content.shape[-1]), moment.rng)
+                contents.append(rows.reshape(content.shape))
+            else:  # a frame of a history
+                view, frame = content
+                contents.append((views.setdefault(id(view), _Perturbed(view, self.transform, moment.rng)), frame))
+        return store.rearranged(slots, contents)
+
+
+class _Perturbed(History):
+    """A history whose tokens a transform perturbs as they are gathered."""
+
+    def __init__(self, source: History, transform: HistoryTransform, rng: np.random.Generator) -> None:
+        super().__init__(source.spec, source.exec_start)
+        self._source, self._transform, self._rng = source, transform, rng
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        return self._transform.perturb(self._source.gather(indices), self._rng)
 
 
 @INTERVENTIONS.register("distract")

@@ -143,7 +143,7 @@ class _Moments:
         for step in self._steps:
             recording.show(episode, n_observed, step + 1, required)
             n_observed = step + 1
-            episode.boundaries = self._boundary_frames(first)
+            episode.boundaries = episode.numbers(np.array(sorted(self._boundaries), np.int64))
             episode.subgoal = None if self._subgoal_kind is None else recording.subgoal(step, self._subgoal_kind)
             episode.subgoals.append(episode.subgoal)
             for probed in arms:
@@ -190,11 +190,6 @@ class _Moments:
     def _phase(self, step: int) -> int:
         """Sub-tasks of the execution that began before this step's."""
         return sum(self._recording.exec_start < frame <= step for frame in self._boundaries)
-
-    def _boundary_frames(self, probed: ProbedPolicy) -> list[int]:
-        """Where sub-tasks began, as numbers of observed frames."""
-        displayed = probed.arm.feed.displayed(np.array(self._boundaries), self._recording.exec_start, probed.before)
-        return sorted({int(frame) for frame in displayed if frame >= 0})
 
     def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
         """Frames that any of these arms reads; None for all."""

@@ -12,6 +12,7 @@ from mme_vla.data.keyframes import KeyframeDataset
 from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import require
+from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import TrainsOnKeyframes, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
@@ -82,6 +83,12 @@ def prepare_data(
             for source in sources
         ]
 
+    transforms = build_transforms(data.get("history_transforms"))
+    require(
+        not transforms or processor.samples.kind != "keyframes",
+        "data.history_transforms changes frames, and this policy learns from keyframes: leave it empty.",
+    )
+
     def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
         if processor.samples.kind == "keyframes":
             keyframes = policy.keyframes if isinstance(policy, TrainsOnKeyframes) else 1
@@ -90,6 +97,7 @@ def prepare_data(
         return kind(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
             mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal, seed=seed,
+            transforms=() if held_out else transforms,
         )  # fmt: skip
 
     held_out = sum(map(len, split.val))

@@ -10,7 +10,15 @@ from typing import Any
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
-from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, newest_checkpoint, resolve_checkpoint, step_of
+from mme_vla.policy.run_folders import (
+    CHECKPOINTS,
+    checkpoints_in,
+    newest_checkpoint,
+    newest_write,
+    resolve_checkpoint,
+    step_of,
+    trainings_in,
+)
 from mme_vla.policy.saving import policy_name
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
@@ -23,8 +31,8 @@ PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
 
 MAY_DIFFER = (
-    "name", "full_size", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
-    "train.save_every", "train.keep", "train.parallel", "train.prefetch_gb", "train.workers",
+    "name", "full_size", "output", "resume", "trainings", "init_from", "logger", "train.steps", "train.log_every",
+    "train.val_every", "train.save_every", "train.keep", "train.parallel", "train.prefetch_gb", "train.workers",
     "train.open_loop_chunks", "train.device",
     "data.cache", "data.content", "trust_plugins",
 )  # fmt: skip
@@ -146,7 +154,8 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration with what runs of earlier versions did not say, because there was no other choice."""
     train = {f.name: f.default for f in fields(TrainSettings) if f.default is not MISSING and f.name != "seed"}
-    data = dict(config.get("data") or {})
+    data = {"history_transforms": [], **(config.get("data") or {})}
+    learning = {"learning": {"history_transforms": [], **config["learning"]}} if config.get("learning") else {}
     if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:  # now the default
         data["val_episodes"] = None
     return {
@@ -154,6 +163,7 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         "embodiment": embodiment_of(config).to_dict(),
         "train": {**train, **config["train"]},
         "data": data,
+        **learning,
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
         **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
@@ -198,6 +208,24 @@ def _newest_unfinished(folder: Path) -> Path | None:
         if checkpoints:
             return None if (run / SUMMARY).is_file() and run != folder else checkpoints[-1]
     return None
+
+
+def unfinished_trainings(folder: Path, count: int) -> Path:
+    """`folder`, or the newest folder beside it that holds trainings of which fewer than `count` are finished."""
+    beside = [path for path in folder.parent.glob("*") if trainings_in(path)]
+    newest = max(beside, key=newest_write, default=folder)
+    finished = [run for run in trainings_in(newest) if (run / SUMMARY).is_file()]
+    return newest if len(finished) < count else folder
+
+
+def check_finished(trainings: Sequence[Path]) -> None:
+    """Make sure that all trainings of a recipe are finished, so that their last checkpoints are alike."""
+    lacking = [run for run in trainings if not (run / SUMMARY).is_file()]
+    require(
+        not lacking,
+        f"{', '.join(map(str, lacking))}: not finished. Repeat the command that trains, with trainings=… and "
+        f"resume={lacking[0].parent if lacking else ''}, or evaluate one that is finished.",
+    )
 
 
 ASK, NONE = "ask", "none"

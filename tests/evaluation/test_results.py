@@ -96,7 +96,9 @@ def test_the_bootstrap_covers_the_truth_as_frequently_as_it_says() -> None:
     rng, covered = np.random.default_rng(1), 0
     for trial in range(200):
         interval = bootstrap(
-            {t: (rng.random(50) < p).astype(float) for t, p in (("a", 0.2), ("b", 0.7))}, samples=300, seed=trial
+            {t: [(rng.random((50, 1)) < p).astype(float)] for t, p in (("a", 0.2), ("b", 0.7))},
+            samples=300,
+            seed=trial,
         )
         covered += interval.low <= 0.45 <= interval.high
     assert 0.89 <= covered / 200 <= 0.99

@@ -12,6 +12,7 @@ import torch
 from helpers.probe_fakes import made_up, probed, reader
 from helpers.rollout_fakes import quick_policy
 from mme_vla.errors import UserError
+from mme_vla.memory.transforms import RepeatFrame
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.probing.channels import channel_of
 from mme_vla.probing.lines import EntryLine, MomentLine, append, read
@@ -96,7 +97,7 @@ def test_words_that_are_no_arms_are_reported(word: Any, message: str) -> None:
 
 def test_arms_compose_in_their_order(tmp_path: Path) -> None:
     arm = read_arm("nodemo+pause:8+drop:2")
-    assert (arm.feed.video, arm.feed.stills) == (False, 8) and arm.edits
+    assert (arm.feed.video, arm.feed.transforms) == (False, (RepeatFrame(8, 0),)) and arm.edits
     lines = probed(reader(0), ["nodemo", "nodemo+drop:all", "drop:all"], tmp_path)
     moments = [line for line in lines if isinstance(line, MomentLine)]
     assert {len(line.touched) for line in moments if line.arm == "nodemo"} == {0}

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,17 +74,25 @@ def task_interval(outcomes: Outcomes, confidence: float = 0.95) -> Interval:
 
 
 def bootstrap(
-    tasks: Mapping[str, np.ndarray], confidence: float = 0.95, samples: int = 10_000, seed: int = 0
+    tasks: Mapping[str, Sequence[np.ndarray]], confidence: float = 0.95, samples: int = 10_000, seed: int = 0
 ) -> Interval:
-    """Percentile interval of a mean over tasks, drawing episodes anew within each task.
+    """Percentile interval of a mean over tasks, drawing episodes anew within each task, and trainings anew for all.
 
-    tasks: for each task a number per episode [episodes], already averaged over the runs: an episode is sampled with all
-    of them.
+    tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs of a training: an
+    episode is sampled with all of them. The figure of several methods is the sum of theirs. Of one training none is
+    drawn.
     """
     rng = np.random.default_rng(seed)
+    counts = [values.shape[1] for values in next(iter(tasks.values()))]
+    one = rng if max(counts) == 1 else np.random.default_rng([seed, 1])
+    # How often each training is drawn, as shares: [samples, trainings] a method.
+    shares = [one.multinomial(n, np.full(n, 1 / n), samples) / n if n > 1 else np.ones((samples, 1)) for n in counts]
     means = np.zeros(samples)
-    for values in tasks.values():
-        means += values[rng.integers(0, len(values), (samples, len(values)))].mean(1)
+    for of_methods in tasks.values():
+        n_episodes = len(of_methods[0])
+        drawn = rng.integers(0, n_episodes, (samples, n_episodes))
+        for values, share in zip(of_methods, shares, strict=True):
+            means += sum(values[:, i][drawn].mean(1) * share[:, i] for i in range(values.shape[1]))
     tail = (1 - confidence) / 2
     low, high = np.quantile(means / len(tasks), [tail, 1 - tail])
     return Interval(float(low), float(high))
@@ -114,7 +122,8 @@ DEFAULT_BUDGET = 512
 class Figure:
     """One number of a table, in percent.
 
-    mean, std: over the complete runs; None without one (`std` needs two). interval: see `intervals.py`.
+    mean, std: over the complete trainings, or over the complete runs of one; None without one (`std` needs two).
+    interval: over episodes, and over trainings where there are several.
     runs, complete: runs there are, and those that have every episode of this figure.
     done, expected: episodes of all runs. partial: rate of the episodes that are done, if no run is complete.
     paper: what the paper reports here.
@@ -166,8 +175,9 @@ class Run:
 
 @dataclass
 class Method:
-    """All runs of one model, with the figures of every scope in `figures[kind][name]`.
+    """All runs of one model by one recipe, with the figures of every scope in `figures[kind][name]`.
 
+    recipe, data: digests of what its trainings share; None where records do not name them.
     repeated, flipped: see `Comparison`.
     """
 
@@ -178,6 +188,8 @@ class Method:
     runs: list[Run]
     paper: PaperMethod | None
     composition: str | None = None
+    recipe: str | None = None
+    data: str | None = None
     figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
     repeated: int = 0
     flipped: int = 0
@@ -187,8 +199,21 @@ class Method:
         return self.figures["average"]["average"]
 
     @property
+    def trainings(self) -> list[list[Run]]:
+        """The runs of each training; all in one group where records do not name their training."""
+        return by_training(self.runs)
+
+    @property
     def complete(self) -> bool:
         return all(run.complete for run in self.runs)
+
+
+def by_training(runs: Iterable[Run]) -> list[list[Run]]:
+    """Runs by the seed of their training, in their order; one group where records do not name their training."""
+    groups: dict[int | None, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(None if run.key.training is None else run.key.training.seed, []).append(run)
+    return list(groups.values())
 
 
 @dataclass
@@ -237,11 +262,12 @@ def aggregate(
         f"None of the {len(selected)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1}).",
     )
     _check_environments(counted)
-    groups: dict[tuple[str, str | None, int | None, str | None], list[Run]] = {}
+    groups: dict[tuple[Any, ...], list[Run]] = {}
     for key, members in by_run(counted).items():
         run = Run(key, {record.key: record for record in members}, protocol)
-        groups.setdefault((key.model, key.subgoal, key.memory_budget, key.composition), []).append(run)
-    methods = [_method(*group, runs, protocol) for group, runs in groups.items()]
+        trained = (None, None) if key.training is None else (key.training.recipe, key.training.data)
+        groups.setdefault((key.model, key.subgoal, key.memory_budget, key.composition, *trained), []).append(run)
+    methods = [_method(runs, protocol, *group) for group, runs in groups.items()]
     repeats = repeated_episodes(records)
     for method in methods:
         counts = [repeats[run.key] for run in method.runs if run.key in repeats]
@@ -269,25 +295,37 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
     notes = []
     for label in [name for name, count in Counter(method.label for method in methods).items() if count > 1]:
         same = [method for method in methods if method.label == label]
+        names = [name for name in ("composition", "recipe", "data") if len({getattr(m, name) for m in same}) > 1]
         for method in same:
-            method.label = f"{label}#{(method.composition or 'unrecorded')[:10]}"
+            digests = [(getattr(method, name) or "unrecorded")[:10] for name in names]
+            method.label = "#".join([label, *digests])
+        kinds = {"composition": "configurations", "recipe": "recipes of training", "data": "datasets"}
+        what = "configurations" if "composition" in names else " and ".join(kinds[name] for name in names)
+        lacking = any(getattr(method, name) is None for method in same for name in names)
         notes.append(
-            f"{len(same)} different configurations are called {label}; they are not averaged: "
-            f"{', '.join(method.label for method in same)} (the digest of `composition` in their records"
-            + ("; records without it are of an earlier version)." if any(m.composition is None for m in same) else ").")
+            f"{len(same)} different {what} are called {label}; they are not averaged: "
+            f"{', '.join(method.label for method in same)} (the digest of `{'` and `'.join(names)}` in their records"
+            + ("; records without it are of an earlier version)." if lacking else ").")
         )
     return notes
 
 
 def _method(
-    model: str, subgoal: str | None, budget: int | None, composition: str | None, runs: list[Run], protocol: Protocol
+    runs: list[Run],
+    protocol: Protocol,
+    model: str,
+    subgoal: str | None,
+    budget: int | None,
+    composition: str | None,
+    recipe: str | None,
+    data: str | None,
 ) -> Method:
     papers = budget in (None, DEFAULT_BUDGET) and not any(is_other(run.key.split) for run in runs)
     known = paper.paper_method(model, subgoal) if papers else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
-    runs = sorted(runs, key=lambda run: (str(run.key.checkpoint).zfill(12), run.key.model_seed))
-    method = Method(label, model, subgoal, budget, runs, known, composition)
+    runs = sorted(runs, key=lambda run: (_seed(run), str(run.key.checkpoint).zfill(12), run.key.model_seed))
+    method = Method(label, model, subgoal, budget, runs, known, composition, recipe, data)
     for scope in scopes(protocol):
         reported = _reported(known, scope, protocol)
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
@@ -302,6 +340,10 @@ def _method(
             figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
+
+
+def _seed(run: Run) -> int:
+    return 0 if run.key.training is None else run.key.training.seed or 0
 
 
 def _of_difficulty(level: str, difficulties: dict[EpisodeKey, str]) -> Callable[[Run, str], list[bool] | None]:
@@ -323,6 +365,7 @@ def _figure(
 ) -> Figure:
     """A figure over whole tasks, from the runs that have all of them."""
     per_run = [[pick(run, task) for task in tasks] for run in runs]
+    whole = [run for run, of_tasks in zip(runs, per_run, strict=True) if None not in of_tasks]
     complete = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
     done = [record for run in runs for key, record in run.records.items() if key.task in tasks]
     counts = {
@@ -333,17 +376,19 @@ def _figure(
         partial = 100 * sum(record.success for record in done) / len(done) if done else None
         return Figure(None, None, None, **counts, partial=partial, paper=reported)
     matrices = [np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))]  # episodes × runs
-    mean, std = mean_std([float(np.mean([matrix[:, r].mean() for matrix in matrices])) for r in range(len(complete))])
-    if len(tasks) == 1:
+    place = {id(run): number for number, run in enumerate(whole)}
+    rows = [[place[id(run)] for run in members] for members in by_training(whole)]
+    trainings = [np.stack([matrix[:, row].mean(1) for row in rows], 1) for matrix in matrices]  # episodes × trainings
+    units = trainings if len(rows) > 1 else matrices
+    mean, std = mean_std([float(np.mean([unit[:, r].mean() for unit in units])) for r in range(units[0].shape[1])])
+    if len(tasks) == 1 and len(rows) == 1:
         interval = task_interval(matrices[0], protocol.confidence)
     else:
-        episodes = {task: matrix.mean(1) for task, matrix in zip(tasks, matrices, strict=True)}
+        episodes = {task: [matrix] for task, matrix in zip(tasks, trainings, strict=True)}
         interval = bootstrap(episodes, protocol.confidence, protocol.samples, protocol.seed)
         if interval.low == interval.high:  # all episodes of a task alike, as with no success at all: nothing to draw
-            trials = sum(map(len, episodes.values()))
-            interval = wilson(
-                float(np.mean([values.mean() for values in episodes.values()])), trials, protocol.confidence
-            )
+            trials = sum(map(len, trainings))
+            interval = wilson(float(np.mean([values.mean() for values in trainings])), trials, protocol.confidence)
     percent = Interval(100 * interval.low, 100 * interval.high)
     return Figure(100 * mean, None if std is None else 100 * std, percent, **counts, paper=reported)
 

@@ -15,7 +15,7 @@ from mme_vla.evaluation.results.scopes import Protocol, scopes
 class Comparison:
     """`first` minus `second`, in percentage points, over the episodes that all runs of both have.
 
-    first_rate, second_rate, difference: means over tasks. interval: paired bootstrap over episodes.
+    first_rate, second_rate, difference: means over tasks. interval: paired bootstrap over episodes, and over trainings.
     wins, losses: episodes that the first, or the second, solved in a larger share of its runs; the rest are ties.
     p: exact two-sided test on wins and losses (McNemar's where each has one run). corrected: by Holm, over all
         comparisons made together. significant: `corrected` is below 1 − confidence.
@@ -86,36 +86,40 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     tasks = [task for task in shared if task in protocol.averaged] or shared
     common = [key for key in common if key.task in tasks]
     by_task = {
-        task: np.array([[side[key] for side in rates] for key in common if key.task == task])  # episodes × 2
+        task: [np.array([side[key] for key in common if key.task == task]) for side in rates]  # episodes × trainings
         for task in tasks
     }
-    means = 100 * np.mean([values.mean(0) for values in by_task.values()], axis=0)
-    gaps = {task: values[:, 0] - values[:, 1] for task, values in by_task.items()}
+    means = 100 * np.mean([[side.mean() for side in sides] for sides in by_task.values()], axis=0)
+    gaps = {task: first.mean(1) - second.mean(1) for task, (first, second) in by_task.items()}
+    trained = any(len(method.trainings) > 1 for method in (first, second))
+    drawn = {task: [sides[0], -sides[1]] if trained else [gaps[task][:, None]] for task, sides in by_task.items()}
     everything = np.concatenate(list(gaps.values()))
     wins, losses = int((everything > 0).sum()), int((everything < 0).sum())
     p = sign_test(wins, losses)
     suites = {}
     for scope in scopes(protocol):
-        inside = {task: gaps[task] for task in scope.tasks if task in gaps}
+        inside = [task for task in scope.tasks if task in gaps]
         if scope.kind == "suite" and inside:
             suites[scope.name] = (
-                100 * float(np.mean([g.mean() for g in inside.values()])),
-                _interval(inside, protocol),
+                100 * float(np.mean([gaps[task].mean() for task in inside])),
+                _interval({task: drawn[task] for task in inside}, protocol),
             )
     return Comparison(
         first.label, second.label, len(common), len(protocol.averaged) * protocol.episodes, float(means[0]),
-        float(means[1]), float(means[0] - means[1]), _interval(gaps, protocol), wins, losses, p, p,
+        float(means[1]), float(means[0] - means[1]), _interval(drawn, protocol), wins, losses, p, p,
         p < 1 - protocol.confidence, suites, first.repeated + second.repeated, first.flipped + second.flipped,
     )  # fmt: skip
 
 
-def _rates(method: Method) -> dict[EpisodeKey, float]:
-    """For each episode that every run has: the share of runs that solved it."""
+def _rates(method: Method) -> dict[EpisodeKey, list[float]]:
+    """For each episode that every run has: the share of each training's runs that solved it."""
     common = set.intersection(*(set(run.records) for run in method.runs))
-    ordered = sorted(common)
-    return {key: float(np.mean([run.records[key].success for run in method.runs])) for key in ordered}
+    return {
+        key: [float(np.mean([run.records[key].success for run in runs])) for runs in method.trainings]
+        for key in sorted(common)
+    }
 
 
-def _interval(gaps: dict[str, np.ndarray], protocol: Protocol) -> Interval:
+def _interval(gaps: dict[str, list[np.ndarray]], protocol: Protocol) -> Interval:
     low, high = bootstrap(gaps, protocol.confidence, protocol.samples, protocol.seed)
     return Interval(100 * low, 100 * high)

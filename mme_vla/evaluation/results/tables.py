@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mme_vla.errors import printable
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Figure, Method, Results
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import PAPER_SEEDS
 from mme_vla.utils.pages import escape_markdown
@@ -71,7 +71,8 @@ def overview(results: Results) -> Table:
     """Methods × suites, as the paper's suite table."""
     suites = results.protocol.suites
     level = f"{100 * results.protocol.confidence:g} %"
-    columns = ["method", "runs", "episodes", *suites, "average", level, "paper"]
+    nested = any(len(method.trainings) > 1 for method in results.methods)
+    columns = ["method", *(["trainings"] if nested else []), "runs", "episodes", *suites, "average", level, "paper"]
     rows = []
     for method in results.methods:
         average = method.average
@@ -80,8 +81,10 @@ def overview(results: Results) -> Table:
         )
         cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
         figures = [show(average, short=True), span(average), show_paper(average)]
-        rows.append([method.label, str(average.runs), episodes, *cells, *figures])
-    return Table("Success rate (%), mean ± sample standard deviation over runs", columns, rows)
+        trainings = [str(len(method.trainings))] if nested else []
+        rows.append([method.label, *trainings, str(average.runs), episodes, *cells, *figures])
+    over = "trainings, or over the runs of one" if nested else "runs"
+    return Table(f"Success rate (%), mean ± sample standard deviation over {over}", columns, rows)
 
 
 def detail(method: Method, results: Results) -> Table:
@@ -113,14 +116,18 @@ def detail(method: Method, results: Results) -> Table:
 def runs_table(results: Results) -> Table:
     """Every run: how far it is, how its episodes ended, and its average."""
     rows = []
+    named = any(run.key.training for method in results.methods for run in method.runs)
     for method in results.methods:
         for run in method.runs:
             outcomes = run.outcomes
             rate = f"{100 * outcomes['success'] / run.expected:.2f}" if run.complete else "incomplete"
             done = f"{len(run.averaged)} of {run.expected}"
             counts = [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
-            rows.append([method.label, str(run.key.checkpoint), str(run.key.model_seed), done, *counts, rate])
-    columns = ["method", "checkpoint", "seed", "episodes", "success", "fail", "timeout", "error", "average (%)"]
+            seed = [str(run.key.training.seed) if run.key.training else ""] if named else []
+            rows.append([method.label, *seed, str(run.key.checkpoint), str(run.key.model_seed), done, *counts, rate])
+    trained = ["training seed"] if named else []
+    ends = ["episodes", "success", "fail", "timeout", "error", "average (%)"]
+    columns = ["method", *trained, "checkpoint", "seed", *ends]
     return Table("Runs", columns, rows)
 
 
@@ -148,7 +155,10 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
         runs = [run for run in method.runs if run.key.checkpoint == checkpoint]
         order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
         runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
-        columns = ["Task", *(f"Seed {run.key.model_seed}" for run in runs), "Average"]
+        several = len(by_training(runs)) > 1
+        names = [f"Training {run.key.training.seed}, " if several and run.key.training else "" for run in runs]
+        seeds = [f"{name}Seed {run.key.model_seed}" for name, run in zip(names, runs, strict=True)]
+        columns = ["Task", *seeds, "Average"]
         values: list[list[float | str]] = []
         for task in results.protocol.averaged:
             row: list[float | str] = []
@@ -163,8 +173,8 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
             values.append(row)
         run_columns = [[row[i] for row in values] for i in range(len(runs))]
         values.append([_mean(column) for column in run_columns])
-        names = [*results.protocol.averaged, "**Average**"]
-        rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(names, values, strict=True)]
+        labels = [*results.protocol.averaged, "**Average**"]
+        rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(labels, values, strict=True)]
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
     return tables
 

@@ -22,6 +22,7 @@ from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, cl
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
 from mme_vla.policy.saving import composition_digest
+from mme_vla.policy.training_identity import identity_of
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
@@ -232,6 +233,7 @@ def facts_of(
     return RunFacts(
         name or str(policy.config.get("name", "policy")), checkpoint_label(source), settings.seed, settings.split,
         settings.max_steps, subgoal, memory_budget(policy), composition_digest(policy.config),
+        identity_of(policy.config),
     )  # fmt: skip
 
 
@@ -254,7 +256,7 @@ def _done(output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | Non
     """What the folder has of these episodes, whichever process wrote it, or this one; folders below hold other runs."""
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
     run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
-                 facts.composition)  # fmt: skip
+                 facts.composition, facts.training)  # fmt: skip
     keys = {(job.task, job.episode) for job in jobs}
     files = sorted(output.glob("episodes*.jsonl")) if shard is None or shard.count == 1 else [output / shard.file]
     records = [record for path in files for record in read_records(path)]

@@ -28,6 +28,7 @@ from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.scheduler import Act, Prepare, Scheduler
+from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.subgoal import SubgoalPredictor
 
 
@@ -83,6 +84,7 @@ class RunFacts:
     subgoal: str | None = None
     memory_budget: int | None = None
     composition: str | None = None
+    training: TrainingIdentity | None = None
 
 
 @dataclass

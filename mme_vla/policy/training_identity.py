@@ -1,0 +1,77 @@
+"""What tells one training from another: its seed, and digests of its recipe, its data and its weights."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from mme_vla.config.naming import digest, flat
+from mme_vla.config.sections import Range, read_section
+from mme_vla.utils import Sums
+
+KEY = "training"
+"""The section of a checkpoint's configuration that holds the identity of its training."""
+_RECIPE = ("train", "finetune", "learning", "init_from")
+_POLICY = ("augment", "compute_dtype")
+_DATA = ("action_offset", "mask_padding", "jitter", "history_transforms")
+_NO_EFFECT = (
+    "train.log_every", "train.val_every", "train.val_samples", "train.save_every", "train.keep", "train.parallel",
+    "train.prefetch_gb", "train.workers", "train.open_loop_chunks", "train.device", "train.seed",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainingIdentity:
+    """The training that a checkpoint is of.
+
+    seed: of fresh weights, data order and noise. recipe: digest of the settings that change an update. data: digest of
+    the contents of the datasets and of their split. weights: digest of a checkpoint's weights.
+    """
+
+    seed: Annotated[int, Range(-(2**63), 2**63)] | None = None
+    recipe: str | None = None
+    data: str | None = None
+    weights: str | None = None
+
+
+def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any]:
+    """The identity of a training before it has weights, as plain values for the policy's configuration.
+
+    Args:
+        config: the plain configuration of a training. content: fingerprints of its datasets.
+    """
+    data = config.get("data") or {}
+    settings = {key: config.get(key) for key in _RECIPE} | {
+        "policy": {key: (config.get("policy") or {}).get(key) for key in _POLICY},
+        "data": {key: data.get(key) for key in _DATA},
+    }
+    if settings["init_from"] is not None:
+        settings["init_from"] = _start(str(settings["init_from"]))
+    recipe = {
+        key: value
+        for key, value in flat(settings).items()
+        if value not in (None, [], {}) and not any(f"{key}.".startswith(f"{free}.") for free in _NO_EFFECT)
+    }
+    split = {"content": list(content), **{key: data.get(key) for key in ("val_fraction", "val_episodes")}}
+    identity = TrainingIdentity(int(config["seed"]), digest(recipe, 12), digest(split, 12))
+    return {key: value for key, value in asdict(identity).items() if value is not None}
+
+
+def identity_of(config: Mapping[str, Any]) -> TrainingIdentity | None:
+    """The training that a policy's configuration names; None where it was not trained, or by an earlier version."""
+    section = config.get(KEY)
+    return None if section is None else read_section(TrainingIdentity, section, KEY)
+
+
+def weights_digest(folder: Path) -> str | None:
+    """Twelve letters of the checksums of a checkpoint's weights; None where it has no checksums."""
+    from mme_vla.policy.tensor_files import list_weight_files  # PyTorch, which results do without
+
+    table = Sums(folder).table
+    sums = [table[name] for name in sorted(list_weight_files(folder)) if name in table]
+    return digest({"weights": sums}, 12) if sums else None
+
+
+def _start(source: str) -> str:
+    """What weights to start from are called in a recipe: their digest, or the end of their path."""
+    return weights_digest(Path(source)) or Path(source).name

@@ -1,0 +1,194 @@
+"""History transforms: one map of frames that training and probes share."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.memory_fakes import LastFrames, encode, same
+from helpers.nano_policies import demonstration, nano
+from helpers.probe_fakes import probed, reader
+from mme_vla import UserError, register
+from mme_vla.data.cache import VisionCache
+from mme_vla.data.cache_building import ensure_cache
+from mme_vla.data.dataset import GroupDataset, TrainingDataset
+from mme_vla.data.sources import open_sources
+from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.evaluation.feed import Feed
+from mme_vla.memory.history import CachedHistory, StorageSpec
+from mme_vla.memory.transforms import (
+    DropFrames,
+    HistoryTransform,
+    Noise,
+    RepeatFrame,
+    Speed,
+    TransformedHistory,
+    build_transforms,
+    map_frames,
+)
+from mme_vla.nano.learning import Decisions, statistics
+from mme_vla.probing.arms import options_of, read_arm
+from mme_vla.probing.lines import MomentLine
+from mme_vla.processing.processor import Processor
+from mme_vla.processing.tokenizer import Tokenizer
+from mme_vla.registry import HISTORY_TRANSFORMS
+
+EVERY = [RepeatFrame(16), Speed(2.0), DropFrames(0.5)]
+
+
+@pytest.mark.parametrize("transform", EVERY)
+def test_a_map_is_ascending_and_ends_at_the_current_frame(transform: HistoryTransform) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        shown = map_frames([transform], 40, 10, rng, keep=[39])
+        assert (np.diff(shown.real) >= 0).all() and shown.real[-1] == 39
+        assert (shown.real[: shown.exec_start] < 10).all() and shown.real[shown.exec_start] >= 10
+        again = map_frames([transform], 40, 10, np.random.default_rng(seed), keep=[39])
+        assert np.array_equal(shown.real, again.real)
+
+
+@pytest.mark.parametrize("transform", [*EVERY, Speed(0.5)])
+def test_in_a_probe_no_frame_depends_on_a_later_one(transform: HistoryTransform) -> None:
+    full = map_frames([transform], 60, 10).real
+    for length in (12, 33, 59):
+        part = map_frames([transform], length, 10).real
+        assert np.array_equal(part, full[full < length])
+
+
+def test_transforms_have_the_lengths_they_say() -> None:
+    assert len(map_frames([RepeatFrame(16)], 40, 10).real) == 56
+    assert len(map_frames([Speed(2.0)], 40, 0).real) == 20 and len(map_frames([Speed(0.5)], 40, 0).real) == 80
+    assert len(map_frames([DropFrames(0.25)], 40, 0).real) == 30
+    assert len(map_frames([Speed(2.0), RepeatFrame(16)], 40, 0).real) == 36
+    assert len(map_frames([RepeatFrame(16, p=0.0)], 40, 10, np.random.default_rng(0)).real) == 40
+
+
+def test_a_feed_shows_frames_as_the_map_does() -> None:
+    feed = Feed(transforms=(RepeatFrame(8, 2), Speed(2.0)))
+    real = map_frames(feed.transforms, 50, 5).real
+    assert np.array_equal(np.repeat(np.arange(50), feed.repeats(np.arange(50), 5)), real)
+    last = feed.displayed(np.arange(50), 5)
+    assert all(real[n] == frame for frame, n in enumerate(last) if n >= 0) and (last >= 0).sum() == len(set(real))
+    assert feed.source_frames(np.arange(20), 5).tolist() == sorted(set(real[:20].tolist()))
+    assert np.array_equal(Feed().repeats(np.arange(9), 3), np.ones(9))
+
+
+def test_a_frame_without_tokens_is_replaced_by_the_newest_stored_one_before_it() -> None:
+    spec, stored = StorageSpec(1, keep_every=4), np.array([0, 3, 7, 11])
+    tokens = stored[:, None, None].astype(np.float32)
+    shown = map_frames([Speed(0.5)], 12, 0)
+    history = TransformedHistory(CachedHistory(spec, tokens, stored, 12), shown)
+    frames = np.array([0, 7, 13, 15])
+    assert shown.real[frames].tolist() == [0, 3, 6, 7]
+    assert history.gather(np.stack([frames, np.zeros(4, int)], 1))[:, 0].tolist() == [0, 3, 3, 7]
+
+
+def test_noise_perturbs_by_its_share_of_the_deviation() -> None:
+    rows = torch.randn(400, 8, generator=torch.Generator().manual_seed(0)) * 3
+    noise = Noise(0.1).perturb(rows, np.random.default_rng(0)) - rows
+    assert float(noise.std()) == pytest.approx(0.3, rel=0.1)
+
+
+def test_entries_that_are_no_transforms_are_reported() -> None:
+    assert build_transforms(["repeat_frame", {"name": "speed", "factor": 4}]) == (RepeatFrame(), Speed(4))
+    for entries, words in (("speed", "a list of names"), (["sped"], "Did you mean 'speed'"), ([{"factor": 2}], "name"),
+                           ([{"name": "speed", "factor": 99}], "factor=99")):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            build_transforms(entries)
+
+
+def test_a_transform_that_returns_too_few_numbers_is_reported() -> None:
+    class Short(HistoryTransform):
+        def repeats(self, length: int, exec_start: int, rng: np.random.Generator | None = None) -> np.ndarray:
+            return np.ones(2, np.int64)
+
+    with pytest.raises(UserError, match="one for each of 9 frames"):
+        map_frames([Short()], 9, 0)
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Processor, list[VisionCache]]:
+    sources = open_sources(["sample"])
+    processor = Processor(image_size=28, tokenizer=Tokenizer.load("sample"), stats=compute_norm_stats(sources))
+    root = tmp_path_factory.mktemp("caches")
+    return sources, processor, [ensure_cache(sources[0], LastFrames(), encode, "abc", root=root, dtype="float32")]
+
+
+def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
+    sources, processor, caches = sample
+    plain = TrainingDataset(sources, processor, LastFrames(), caches)
+    changed = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(32, p=1.0)])
+    items = [changed[60], changed[60]]
+    assert same(*items) and not same(items[0]["history"], plain[60]["history"])
+    assert int(items[0]["history"].step) > int(plain[60]["history"].step)
+    for key in ("images", "state", "actions", "prompt"):
+        if key in items[0]:
+            assert torch.equal(items[0][key], plain[60][key]), key
+    changed.set_epoch(1)
+    assert not same(changed[60]["history"], items[0]["history"])
+    assert same(changed.observation(60), plain.observation(60)), "what a policy meets when acting is not transformed"
+    nothing = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(0)])
+    assert same(nothing[60]["history"], plain[60]["history"])
+
+
+def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources, processor, caches = sample
+    data = TrainingDataset(sources, processor, LastFrames(), caches)
+    steps = (data.step(index) for index in range(20, len(data)))
+    step = next(s for s in steps if len(np.unique(sources[0].actions(s.episode, s.index - 4, s.index), axis=0)) > 1)
+    exec_start = int(sources[0].exec_starts[step.episode])
+    shown = map_frames([RepeatFrame(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index])
+    monkeypatch.setattr(Processor, "prompt_spec", replace(processor.prompt_spec, past_actions=4))
+    past = data.past_actions(step, shown)
+    repeated = sources[0].actions(step.episode, step.index - 1, step.index)
+    assert np.array_equal(past, np.repeat(repeated, 4, 0))
+    assert len(data.past_actions(step)) == 4 and not np.array_equal(data.past_actions(step), past)
+
+
+def test_the_times_of_a_group_are_transformed(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    sources, processor, caches = sample
+    monkeypatch.setattr(Processor, "samples", replace(processor.samples, group_size=4))
+    groups = [GroupDataset(sources, processor, LastFrames(), caches, transforms=t) for t in ((), [Speed(0.5)])]
+    plain, slow = (group[1] for group in groups)
+    assert plain["place"] == slow["place"] and (slow["times"] >= plain["times"]).all()
+    assert slow["times"][-1] > plain["times"][-1]
+    assert [int(m["history"].step) for m in slow["moments"]] == slow["times"].tolist()
+
+
+def test_nano_redraws_histories_each_epoch() -> None:
+    policy, made = nano().eval(), demonstration()
+    policy.require_processor().stats = statistics([made], policy)
+    plain = Decisions.of(policy, [made])
+    first, again = (Decisions.of(policy, [made], transforms=[RepeatFrame(32)], seed=1) for _ in range(2))
+    rows = [0, 1, 2]
+    one = first.collate(rows).history
+    assert one is not None and same(one, again.collate(rows).history) and not same(one, plain.collate(rows).history)
+    first.set_epoch(1)
+    assert not same(first.collate(rows).history, one)
+    still = Decisions.of(policy, [made], transforms=[RepeatFrame(0)], seed=1)
+    assert same(still.collate(rows).history, plain.collate(rows).history)
+
+
+def test_a_probe_applies_the_same_objects(tmp_path: Path) -> None:
+    arms = [read_arm(word) for word in ("repeat_frame:8", "speed:2", "drop_frames:0.5", "noise:0.5")]
+    feeds = [arm.feed.transforms for arm in arms]
+    assert feeds == [(RepeatFrame(8),), (Speed(2),), (DropFrames(0.5),), (Noise(0.5),)]
+    assert read_arm("pause:8").feed.repeats(np.arange(9), 3).tolist() == arms[0].feed.repeats(np.arange(9), 3).tolist()
+    assert arms[1].dial() == 2 and options_of(arms[1]) == [{"intervention": "Speed", "factor": 2}]
+    lines = probed(reader(2), ["repeat_frame:8", "speed:2", "drop_frames:0.9", "noise:0.5", "pause:8"], tmp_path)
+    moments = [line for line in lines if isinstance(line, MomentLine)]
+    changes = {name: sum(line.change for line in moments if line.arm == name) for name in {m.arm for m in moments}}
+    assert changes["speed:2"] > 0 and changes["drop_frames:0.9"] > 0 and changes["noise:0.5"] > 0, changes
+    assert changes["repeat_frame:8"] == changes["pause:8"]
+
+
+def test_a_transform_of_ones_own_is_registered() -> None:
+    @register("history_transform", "still_for_a_test")
+    class Still(HistoryTransform):
+        pass
+
+    assert HISTORY_TRANSFORMS["still_for_a_test"] is Still
+    assert np.array_equal(map_frames(build_transforms(["still_for_a_test"]), 5, 0).real, np.arange(5))

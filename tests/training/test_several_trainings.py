@@ -1,0 +1,69 @@
+"""`train trainings=2`: one command, two seeds, one vision cache; it continues with the first that is unfinished."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from mme_vla import MMEPolicy, UserError
+from mme_vla.cli import evaluate as evaluation
+from mme_vla.cli import train as command
+from mme_vla.config.composition import compose
+from mme_vla.evaluation.rollout.evaluation import facts_of
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.run_folders import find_run, locate_checkpoint, trainings_in
+from mme_vla.training.runs import check_finished
+
+SMALL = [
+    "model=framesamp_modul", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
+    "backbone.vision.patch_size=2", "memory.budget=64", "train.steps=2", "train.log_every=1", "train.val_samples=0",
+    "train.batch_size=2", "train.open_loop_chunks=0", "train.device=cpu", "train.workers=0", "trainings=2",
+]  # fmt: skip
+
+
+def test_several_trainings_resume_and_share_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    output = tmp_path / "runs" / "two"
+    words = [*SMALL, f"output={output}", f"data.cache.root={tmp_path / 'cache'}"]
+    original, calls = command.train, []
+
+    def interrupted(*args: Any, **options: Any) -> Path:
+        calls.append(args[2].name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return original(*args, **options)
+
+    monkeypatch.setattr(command, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        command.main(compose("train", words))
+    first = trainings_in(output)[0] / "summary.json"
+    written = first.stat().st_mtime_ns
+    command.main(compose("train", words))
+    assert calls == ["training_0", "training_1", "training_1"] and first.stat().st_mtime_ns == written
+    policies = [MMEPolicy.from_pretrained(locate_checkpoint(run)) for run in trainings_in(output)]
+    facts = [facts_of(policy, None, "one", RolloutSettings(), None).training for policy in policies]
+    assert [one and one.seed for one in facts] == [42, 43] and len({one and one.recipe for one in facts}) == 1
+    assert len({one and one.data for one in facts}) == 1 and len({one and one.weights for one in facts}) == 2
+    fingerprints = {policy.vision_fingerprint() for policy in policies}
+    assert len(fingerprints) == 1
+    assert len([path for path in (tmp_path / "cache").glob("*/*") if path.is_dir()]) == 1
+    parts = [dict(policy.named_parameters())["backbone.action_out.weight"] for policy in policies]
+    assert not torch.equal(*parts)
+    check_finished(trainings_in(output))
+    with pytest.raises(UserError, match="holds 2 trainings"):
+        locate_checkpoint(output)
+    assert find_run(output.parent / "latest") == output
+    evaluated: list[tuple[str, str]] = []
+    monkeypatch.setattr(evaluation, "evaluate_one", lambda cfg, name="": evaluated.append((str(cfg.checkpoint), name)))
+    evaluation.main(compose("evaluate", [f"checkpoint={output}", "tasks=StopCube"]))
+    assert evaluated == [(str(run), run.name) for run in trainings_in(output)]
+    with pytest.raises(UserError, match="other settings"):
+        command.main(compose("train", [*words, "train.lr=1e-5"]))
+    (trainings_in(output)[1] / "summary.json").unlink()
+    with pytest.raises(UserError, match="not finished"):
+        check_finished(trainings_in(output))
+
+
+def test_the_number_of_trainings_is_checked(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="trainings=0"):
+        command.main(compose("train", [*SMALL, f"output={tmp_path}", "trainings=0"]))
