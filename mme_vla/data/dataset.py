@@ -1,7 +1,7 @@
 """The training dataset: one item is one step of an execution phase."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
+from mme_vla.data.columns import label_column, text_column, weight_column
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
@@ -18,6 +19,7 @@ from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.types import HistoryTokens, Labels, labels_read
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,48 @@ class Step:
     recorded: np.ndarray
 
 
+class FurtherColumns:
+    """Labels, sample weights and texts of one dataset, read and checked once; see `TrainingDataset`."""
+
+    def __init__(
+        self,
+        source: EpisodeSource,
+        labels: Sequence[str],
+        memory_labels: Sequence[str],
+        weights: str | None,
+        texts: Mapping[str, str],
+    ) -> None:
+        key = "The policy's labels"
+        self._source, self._memory_labels = source, tuple(memory_labels)
+        self._labels = {name: label_column(source, name, key) for name in dict.fromkeys((*labels, *memory_labels))}
+        self._current = tuple(labels)
+        self._weights = None if weights is None else weight_column(source, weights)
+        self._texts = {note: text_column(source, column) for note, column in texts.items()}
+
+    def items(self, episode: int, frame: int) -> dict[str, Any]:
+        """What a sample at a frame has of these: `labels` and `weight`, where there are any."""
+        (row,) = self._source.rows(episode, np.array([frame]))
+        labels = {name: torch.as_tensor(self._labels[name][row]) for name in self._current}
+        weight = {} if self._weights is None else {"weight": torch.as_tensor(self._weights[row])}
+        return ({"labels": labels} if labels else {}) | weight
+
+    def text(self, note: str, episode: int, frame: int) -> str:
+        """The text of a note at a frame."""
+        (row,) = self._source.rows(episode, np.array([frame]))
+        return str(self._texts[note][int(row)].as_py())
+
+    def with_labels(self, episode: int, selection: HistoryTokens) -> HistoryTokens:
+        """A selection, unbatched, with the labels of each token's frame that the memory reads."""
+        if not self._memory_labels:
+            return selection
+        rows = self._source.rows(episode, (selection.positions[:, 0] * selection.mask).numpy())
+        labels = Labels()
+        for name in self._memory_labels:
+            values = torch.from_numpy(self._labels[name][rows])
+            labels[name] = values * selection.mask.view(-1, *[1] * (values.ndim - 1))
+        return replace(selection, labels=labels)
+
+
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
@@ -62,6 +106,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         mask_padding: bool = False,
         jitter: bool = False,
         subgoal: SubgoalText | None = None,
+        labels: Sequence[str] = (),
+        weights: str | None = None,
+        texts: Mapping[str, str] | None = None,
         seed: int = 42,
     ) -> None:
         """Arrange the samples; nothing is read yet.
@@ -77,6 +124,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             mask_padding: leave repeated actions past the end of an episode out of the loss (released: they count).
             jitter: hand the memory a random generator, for memories that vary their selection in training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
+            labels: of the current frame, that integration and backbone read; those of the memory follow from it.
+            weights: the column of sample weights. texts: note of the prompt → its column of texts.
             seed: of all randomness.
         """
         require(
@@ -97,6 +146,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
+        self.columns = [FurtherColumns(source, labels, labels_read(memory), weights, texts or {}) for source in sources]
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(selected)]).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
@@ -195,12 +245,14 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         item = self.processor.item(self._sample(step, subgoal))
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
+        item |= self.columns[step.source].items(step.episode, step.index)
         if self.memory is not None:
             history = self.caches[step.source].history(step.episode)
             if uses_proprio(self.memory):
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
-            item["history"] = self.memory.gather_selection(history, step.index, rng if self.jitter else None)
+            selection = self.memory.gather_selection(history, step.index, rng if self.jitter else None)
+            item["history"] = self.columns[step.source].with_labels(step.episode, selection)
             if (spec := past_view_spec(self.memory)) is not None:
                 read = partial(self._images, step.source, step.episode)
                 item["past"] = past_views(spec, step.index, read, self.processor.images)

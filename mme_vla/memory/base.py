@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError, require
 from mme_vla.memory.history import FrameScorer, History, LazyHistory, OnlineHistory, StorageSpec
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, Labels, MemoryTokens
 
 POSITION_GRID = 16
 """Rows and columns of token positions are in sixteenths of a view's side, as released, whatever its token grid."""
@@ -53,7 +53,8 @@ class MemoryModule(nn.Module):
         reporting: set from outside for updates that are logged; `forward` then fills `MemoryTokens.metrics`.
 
     Optional capabilities are classes to inherit from as well: `StreamingMemory`, `ScoringMemory`, `ProprioMemory`,
-    `PastViewMemory`, `CompilableMemory`, `MatmulPrecision`.
+    `PastViewMemory`, `CompilableMemory`, `MatmulPrecision`, and `ReadsLabels` (types.py) of a memory whose
+    `MemoryTokens.losses` need labels.
     """
 
     budget: int
@@ -293,14 +294,15 @@ def stack_history(items: Sequence[HistoryTokens], device: torch.device | None = 
     """Stack unbatched selections into one batch [b, n, …]; shorter ones, of left-padded memories, are padded there."""
     length = max(len(item.mask) for item in items)
 
-    def stack(name: str) -> Tensor:
-        rows = [getattr(item, name) for item in items]
+    def stack(rows: Sequence[Tensor]) -> Tensor:
         around = [0, 0] * (rows[0].ndim - 1)
         return torch.stack([nn.functional.pad(row, (*around, length - len(row), 0)) for row in rows]).to(device)
 
     steps = [item.step for item in items if item.step is not None]
     step = torch.stack(steps).to(device) if len(steps) == len(items) else None
-    return HistoryTokens(stack("features"), stack("positions"), stack("mask"), step)
+    labels = Labels({name: stack([item.labels[name] for item in items]) for name in items[0].labels})
+    tokens = [stack([getattr(item, name) for item in items]) for name in ("features", "positions", "mask")]
+    return HistoryTokens(*tokens, step, labels)
 
 
 TEMPORAL_BASE, SPATIAL_BASE = 10_000.0, 1_000.0

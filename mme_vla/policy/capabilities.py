@@ -86,6 +86,14 @@ class AugmentsImages(Protocol):
 
 
 @runtime_checkable
+class WeighsLosses(Protocol):
+    """Learns from auxiliary losses, labels and weighted samples (`Batch.weight`, `Batch.labels`)."""
+
+    loss_weights: Mapping[str, float]
+    """Weights of auxiliary losses by name; training sets it from `train.losses`."""
+
+
+@runtime_checkable
 class CompilesSampling(Protocol):
     """Has a sampler that can be compiled."""
 

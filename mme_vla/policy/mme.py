@@ -152,7 +152,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             memory: memory tokens; by default those of `batch.history`.
 
         Returns:
-            The loss and its metrics; the memory's own begin with `memory/` and are present while `memory.reporting`.
+            The loss and its metrics. Auxiliary losses are `losses/<name>`, unweighted. The memory's own begin with
+            `memory/` and are present while `memory.reporting`.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
@@ -166,9 +167,13 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         if memory is None:
             with self.autocast():
                 memory = self.encode_memory(self.conditioned_history(batch))
-        loss = self.loss(batch, values, memory, augmentation)
+        losses = self.losses(batch, values, memory, augmentation)
+        loss = self.total_loss(losses)
+        metrics = {"loss": loss.detach()}
+        if len(losses) > 1:
+            metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
         reported = {} if memory is None else memory.metrics
-        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
+        return loss, metrics | {f"memory/{name}": value for name, value in reported.items()}
 
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""

@@ -17,7 +17,7 @@ from mme_vla.memory.base import stack_history
 from mme_vla.processing.images import stack_past
 from mme_vla.processing.normalise import NormStats, normalize
 from mme_vla.registry import PROCESSORS
-from mme_vla.types import Batch
+from mme_vla.types import Batch, Labels
 from mme_vla.utils import check_sums, inside, read_json
 
 CONFIG_FILE = "processor.json"
@@ -184,7 +184,8 @@ class PolicyProcessor:
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
         """Items as the batch that the policy reads: an object with `to`.
 
-        An item may also hold `history` (a memory's selection) and `action_mask` [h], which the dataset adds.
+        An item may also hold `history` (a memory's selection), `action_mask` [h], `weight` [] and `labels` (by name),
+        which the dataset adds.
         """
         raise NotImplementedError
 
@@ -276,6 +277,8 @@ def collate(items: Sequence[dict[str, Any]]) -> Batch:
         action_mask=stack("action_mask") if "action_mask" in items[0] else None,
         state=stack("state"),
         past=stack_past([item.get("past") for item in items]),
+        weight=stack("weight") if "weight" in items[0] else None,
+        labels=Labels({name: torch.stack([item["labels"][name] for item in items]) for name in items[0].get("labels", ())}),
     )
     return batch.without_prompt_padding()
 
