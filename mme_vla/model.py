@@ -26,11 +26,11 @@ from types import MappingProxyType
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Backbone, Injection
+from mme_vla.backbone.base import AuxiliaryLosses, Backbone, Injection, KeepsKeysValues
 from mme_vla.errors import check_known, require
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import AuxiliaryLosses, Batch, HistoryTokens, MemoryTokens, Noise
+from mme_vla.types import Batch, HistoryTokens, KeysValues, MemoryTokens, Noise
 
 
 class MMEModel(nn.Module):
@@ -92,17 +92,18 @@ class MMEModel(nn.Module):
         batch = self.prepare_images(batch, augmentation)
         with self.autocast():
             memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
-            losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
-            auxiliary = self.auxiliary_losses(batch, memory) if self.training else {}
+            injection = self.inject(batch, memory)
+            losses = self.backbone.loss(batch, injection, noise)  # b h
+            auxiliary = self.auxiliary_losses(batch, injection, memory) if self.training else {}
         means = {name: weighted_mean(rows.float(), batch.weight) for name, rows in auxiliary.items()}
         return {"action": masked_mean(losses, batch.action_mask, batch.weight), **means}
 
-    def auxiliary_losses(self, batch: Batch, memory: MemoryTokens | None) -> dict[str, Tensor]:
+    def auxiliary_losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, Tensor]:
         """Losses [b] by name that memory, integration and backbone return beside that of the actions."""
         rows = {} if memory is None else dict(memory.losses)
         for part in (self.integration, self.backbone):
             if isinstance(part, AuxiliaryLosses):
-                rows |= part.losses(batch, memory)
+                rows |= part.losses(batch, injection, memory)
         for name, values in rows.items():
             require(
                 name != "action" and values.shape == (len(batch.prompt),),
@@ -138,6 +139,16 @@ class MMEModel(nn.Module):
             memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
             batch = self.prepare_images(batch)
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
+
+    @torch.no_grad()
+    def sample_and_keep(
+        self, batch: Batch, noise: Mapping[str, Tensor], steps: int | None = None, memory: MemoryTokens | None = None
+    ) -> tuple[Tensor, KeysValues]:
+        """A chunk as `sample` returns it, and the keys and values that the backbone made of its prefix."""
+        assert isinstance(self.backbone, KeepsKeysValues)
+        with self.autocast():
+            batch = self.prepare_images(batch)
+            return self.backbone.sample_and_keep(batch, self.inject(batch, memory), noise, steps)
 
     # The steps, in order
 

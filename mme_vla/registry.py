@@ -136,6 +136,13 @@ SUBGOALS: Registry[Any] = Registry(
         "openai": "mme_vla.subgoal.gemini",
     },
 )
+PROMPTS: Registry[Any] = Registry(
+    "prompt format",
+    dict.fromkeys(
+        ("plain", "state", "subgoal", "subgoal_sentence", "past_actions", "openvla", "openvla_subgoal"),
+        "mme_vla.processing.prompt",
+    ),
+)
 TASKS: Registry[Any] = Registry("task")
 PLAYERS: Registry[Any] = Registry(
     "player",
@@ -148,7 +155,7 @@ INTERVENTIONS: Registry[Any] = Registry("intervention")
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
-    "intervention": INTERVENTIONS,
+    "intervention": INTERVENTIONS, "prompt": PROMPTS,
 }  # fmt: skip
 
 
@@ -157,7 +164,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
+            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe) or `prompt` (a prompt format).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

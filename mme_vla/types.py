@@ -143,6 +143,35 @@ class HistoryTokens(TensorStruct):
 
 
 @dataclass
+class KeysValues(TensorStruct):
+    """Keys, rotated, and values of all layers of a backbone, K heads of h numbers each.
+
+    values: [b, layers, 2, n, K, h]; keys first. mask: [b, n] bool; False on padding.
+    """
+
+    values: Tensor
+    mask: Tensor
+
+    def entry(self, row: int) -> Tensor:
+        """The valid tokens of one sample, [layers, 2, n, K, h]."""
+        return self.values[row][:, :, self.mask[row]]
+
+    @classmethod
+    def stack(cls, samples: Sequence[Sequence[Tensor]]) -> Self | None:
+        """The entries of each of b samples, one after the other, padded to one length; None if there is none."""
+        if not (every := [entry for entries in samples for entry in entries]):
+            return None
+        lengths = [sum(entry.shape[2] for entry in entries) for entries in samples]
+        first = every[0]
+        values = first.new_zeros(len(samples), *first.shape[:2], max(lengths), *first.shape[3:])
+        for row, entries, length in zip(values, samples, lengths, strict=True):
+            if length:
+                row[:, :, :length] = torch.cat(list(entries), 2)
+        mask = torch.arange(max(lengths)) < torch.tensor(lengths)[:, None]
+        return cls(values, mask.to(values.device))
+
+
+@dataclass
 class MemoryTokens(TensorStruct):
     """What every neural memory hands over: at most `budget` valid tokens.
 
@@ -151,6 +180,7 @@ class MemoryTokens(TensorStruct):
     ages: [b, budget] float32; how many frames ago the moment was that a token speaks of. None where tokens have no
         moment, or the selection did not say what the current frame is.
     losses: auxiliary losses by name, each [b], with gradients. Only training reads them (`train.losses`).
+    cache: stored keys and values of earlier chunks (`CacheMemory`); None in training, and before the first chunk.
     """
 
     tokens: Tensor
@@ -158,6 +188,7 @@ class MemoryTokens(TensorStruct):
     metrics: dict[str, Tensor] = field(default_factory=dict)
     ages: Tensor | None = None
     losses: dict[str, Tensor] = field(default_factory=dict)
+    cache: KeysValues | None = None
 
 
 @dataclass
@@ -239,21 +270,6 @@ class ReadsLabels:
     """
 
     reads_labels: Sequence[str] = ()
-
-
-class AuxiliaryLosses(ReadsLabels):
-    """Capability of an integration or a backbone: losses beside that of the actions.
-
-    A memory returns its own with its tokens (`MemoryTokens.losses`).
-    """
-
-    def losses(self, batch: Batch, memory: MemoryTokens | None) -> dict[str, Tensor]:
-        """Losses by name, each [b], with gradients; called in training alone.
-
-        Args:
-            batch: its images are prepared, in [-1, 1]. memory: the memory tokens of the batch.
-        """
-        raise NotImplementedError
 
 
 def labels_read(*parts: object) -> tuple[str, ...]:

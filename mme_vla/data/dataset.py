@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.columns import label_column, text_column, weight_column
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, listed, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
 from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
@@ -142,6 +142,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
+        spec = processor.prompt_spec
+        lacking = sorted(set(spec.notes) - set(texts or {}))
+        require(
+            not lacking,
+            f"The prompt format {spec.name!r} reads the notes {listed(lacking)}: name their columns, such as "
+            f"data.texts={{{lacking[0] if lacking else ''}: simple_subgoal}}.",
+        )
         self.sources, self.processor, self.memory = list(sources), processor, memory
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
@@ -245,7 +252,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         item = self.processor.item(self._sample(step, subgoal))
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
-        item |= self.columns[step.source].items(step.episode, step.index)
+        for name, value in self.columns[step.source].items(step.episode, step.index).items():
+            item[name] = item.get(name, {}) | value if name == "labels" else value
         if self.memory is not None:
             history = self.caches[step.source].history(step.episode)
             if uses_proprio(self.memory):
@@ -281,7 +289,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             subgoal=subgoal,
             past_actions=self.past_actions(step),
             actions=step.actions,
+            **self._notes(step),
         )
+
+    def _notes(self, step: Step) -> dict[str, dict[str, str]]:
+        """Notes of the prompt, and the lines to write; one that the policy writes is read a decision later."""
+        spec, columns = self.processor.prompt_spec, self.columns[step.source]
+        before = step.index - self.processor.embodiment.action.execute
+        notes = {name: columns.text(name, step.episode, step.index) for name in spec.notes}
+        written = {name: notes[name] for name in spec.writes}
+        for name in written:
+            notes[name] = columns.text(name, step.episode, before) if before >= step.exec_start else ""
+        return {"notes": notes, "written": written}
 
 
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:

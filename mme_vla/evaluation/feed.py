@@ -13,7 +13,7 @@ from mme_vla.errors import UserError, require
 from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, frames_read, with_vision_memory
+from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, WritesNotes, frames_read, with_vision_memory
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.types import Noise
 
@@ -137,8 +137,9 @@ class FedEpisode(Episode):
     def state(self) -> Tensor:
         return self.inner.state
 
-    def acted(self, chunk: np.ndarray) -> None:
-        self.inner.acted(chunk)
+    def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
+        self.inner.acted(chunk, notes)
+        self.written = self.inner.written
 
     def add_frames(self, *_: Any, **__: Any) -> None:
         """Not offered: a feed decides on whole observations."""
@@ -211,6 +212,10 @@ class FedPolicy(Policy):
         self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         return self.inner.predict_chunk(batch, [inner_episode(episode) for episode in episodes], draws, steps)
+
+    def write_notes(self, batch: Any, episodes: Sequence[Episode]) -> Sequence[Mapping[str, str]]:
+        inner = [inner_episode(episode) for episode in episodes]
+        return self.inner.write_notes(batch, inner) if isinstance(self.inner, WritesNotes) else [{} for _ in inner]
 
 
 def inner_episode(episode: Episode) -> Episode:

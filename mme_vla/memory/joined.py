@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
+    CacheMemory,
     CompilableMemory,
     MemoryModule,
     PastViewMemory,
@@ -59,6 +60,10 @@ class JoinedMemory(
         built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
         self.members = nn.ModuleList(built)
         names = [section["name"] for section in sections]
+        require(
+            not any(isinstance(member, CacheMemory) for member in built),
+            f"memory.members={brief(names)}: a memory of keys and values (CacheMemory) cannot be joined with others.",
+        )
         # Equal names get a number.
         self.names = [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]
         self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))

@@ -12,7 +12,7 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy.capabilities import SupportsRTC
+from mme_vla.policy.capabilities import SupportsRTC, WritesNotes
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
@@ -132,13 +132,14 @@ class Policy(nn.Module):
         self.eval()
         try:
             chunk = self.predict_chunk(batch, episodes, noise, steps).float().cpu()
+            written = self.write_notes(batch, episodes) if isinstance(self, WritesNotes) else [{} for _ in episodes]
         finally:
             self.train(was_training)
         absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
         decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
         actions = torch.stack(decided).numpy()[:, n_past:]
-        for episode, actions_of in zip(episodes, actions, strict=True):
-            episode.acted(actions_of)
+        for episode, actions_of, notes in zip(episodes, actions, written, strict=True):
+            episode.acted(actions_of, notes)
         return actions
 
     def observation(self, episodes: Sequence[Episode]) -> Any:

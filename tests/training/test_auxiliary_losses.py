@@ -14,13 +14,14 @@ import torch
 
 from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.backbone.base import AuxiliaryLosses, Injection
 from mme_vla.data.columns import BOUNDARY, label_column
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.memory.base import stack_history
 from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
 from mme_vla.training.settings import TrainSettings
-from mme_vla.types import AuxiliaryLosses, Batch, Labels, MemoryTokens
+from mme_vla.types import Batch, Labels, MemoryTokens
 
 EXAMPLE = REPOSITORY / "examples" / "write_head"
 TABLE = "data/chunk-000/file-000.parquet"
@@ -80,7 +81,9 @@ def test_evaluation_has_no_auxiliary_loss(policy: MMEPolicy) -> None:
     policy.eval()
     loss, metrics = policy(labelled(policy), noise)
     assert set(metrics) == {"loss"}
-    assert torch.equal(loss, policy(replace(labelled(policy), history=random_batch(policy, valid=32).history), noise)[0])
+    assert torch.equal(
+        loss, policy(replace(labelled(policy), history=random_batch(policy, valid=32).history), noise)[0]
+    )
 
 
 def test_an_unknown_name_in_the_weights_is_an_error(policy: MMEPolicy) -> None:
@@ -105,7 +108,7 @@ def test_integration_and_backbone_may_return_losses() -> None:
     class Sums(type(small_policy("framesamp_modul").integration), AuxiliaryLosses):  # type: ignore[misc]
         reads_labels = ("speed",)
 
-        def losses(self, batch: Batch, memory: MemoryTokens | None) -> dict[str, torch.Tensor]:
+        def losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, torch.Tensor]:
             return {"speed": batch.labels["speed"] * memory.tokens.square().mean((1, 2))}
 
     policy = small_policy("framesamp_modul").train()
@@ -170,5 +173,7 @@ def test_a_bad_label_names_column_and_episode(name: str, change: Any, problem: s
 
 
 def test_an_absent_column_is_reported() -> None:
-    with pytest.raises(UserError, match=r"Unknown column of sample \(data.weights\) 'step_id'. Did you mean 'step_idx'"):
+    with pytest.raises(
+        UserError, match=r"Unknown column of sample \(data.weights\) 'step_id'. Did you mean 'step_idx'"
+    ):
         label_column(EpisodeSource("sample"), "step_id", "data.weights")
