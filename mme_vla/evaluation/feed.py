@@ -83,6 +83,7 @@ class FedEpisode(Episode):
         super().__init__(host, goal, seed)
         self._host, self.seed = host, seed
         self.inner = host.inner.start_episode(goal, seed)
+        self.notes, self.written = self.inner.notes, self.inner.written
         self.exec_start: int | None = None
         self.boundaries: Sequence[int] = ()
 
@@ -139,7 +140,6 @@ class FedEpisode(Episode):
 
     def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
         self.inner.acted(chunk, notes)
-        self.written = self.inner.written
 
     def add_frames(self, *_: Any, **__: Any) -> None:
         """Not offered: a feed decides on whole observations."""

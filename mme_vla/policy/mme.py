@@ -242,7 +242,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     @property
     def compiles_sampling(self) -> bool:
         """Whether the backbone's sampler can be compiled."""
-        return isinstance(self.backbone, CapturableSampling)
+        return isinstance(self.backbone, CapturableSampling) and not isinstance(self.memory, CacheMemory)
 
     def compile_sampling(self, layers: bool = False) -> None:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other kernels.
