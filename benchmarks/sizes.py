@@ -31,6 +31,7 @@ RECIPES = (
     ("experiment=openvla_oft", "model=openvla_oft_framesamp_context", "finetune=oft_memory"),
     ("experiment=memoryvla",),
     ("experiment=memoryvla", "memory=framesamp", "finetune.freeze_vision=true"),
+    ("experiment=simplememvla",),
 )
 
 

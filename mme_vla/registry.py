@@ -117,6 +117,8 @@ POLICIES: Registry[Any] = Registry(
         "sam2act_plus": "mme_vla.methods.sam2act.policy",
         "openvla": "mme_vla.methods.openvla_oft.policy",
         "memoryvla": "mme_vla.methods.memoryvla.policy",
+        "simplememvla": "mme_vla.methods.simplememvla.policy",
+        "subtask": "mme_vla.methods.simplememvla.subtask",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
@@ -127,6 +129,8 @@ PROCESSORS: Registry[Any] = Registry(
         "sam2act_plus": "mme_vla.methods.sam2act.processor",
         "openvla": "mme_vla.methods.openvla_oft.processor",
         "memoryvla": "mme_vla.methods.memoryvla.processor",
+        "simplememvla": "mme_vla.methods.simplememvla.processor",
+        "subtask": "mme_vla.methods.simplememvla.subtask",
     },
 )
 SUBGOALS: Registry[Any] = Registry(

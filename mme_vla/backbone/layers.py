@@ -51,9 +51,14 @@ class Rotation(NamedTuple):
 
 
 def rotation(positions: Tensor, head_dim: int) -> Rotation:
-    """Angles p·10000^(−2i/h) for positions [b, n], whole numbers or not."""
+    """Angles p·10000^(−2i/h) for positions [b, n], whole numbers or not.
+
+    Of positions [b, n, k] the angles use the coordinates in turn.
+    """
     exponent = torch.arange(head_dim // 2, device=positions.device, dtype=torch.float32) * (2 / head_dim)
-    angles = (positions[..., None, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
+    several = positions.ndim == 3
+    places = positions[..., torch.arange(head_dim // 2) % positions.shape[-1]] if several else positions[..., None]
+    angles = (places[:, :, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
     return Rotation(angles.cos(), angles.sin())
 
 
@@ -120,7 +125,8 @@ class Block:
     """A run of tokens that share a name, hence a row of the table, and an expert whose weights process them.
 
     tokens: [b, n, d] at the expert's width. mask: [b, n] bool, False on padding.
-    positions: [b, n] custom rotary positions, on the same axis as those of the other blocks; None counts its tokens.
+    positions: [b, n] custom rotary positions, on the same axis as those of the other blocks; [b, n, k] where a token
+        has k coordinates (time, row, column), which rotate interleaved angles; None counts its tokens.
     """
 
     name: str
@@ -175,13 +181,21 @@ def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
 
 
 def apply_custom_positions(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
-    """Rotary positions [b, n] of blocks in sequence order, with the custom positions of blocks that have them."""
+    """Rotary positions [b, n] of blocks in sequence order, with the custom positions of blocks that have them.
+
+    [b, n, k] if a block has k coordinates: those of tokens with one number are equal.
+    """
     if all(block.positions is None for block in blocks):
         return numbered
     parts = numbered.float().split([len(block) for block in blocks], 1)
     positions = [
         part if block.positions is None else block.positions for part, block in zip(parts, blocks, strict=True)
     ]
+    counts = {part.shape[-1] for part in positions if part.ndim == 3}
+    if len(counts) > 1:
+        raise ValueError(f"Blocks have positions of {sorted(counts)} coordinates: all need as many, or one number.")
+    for count in counts:
+        positions = [part if part.ndim == 3 else part[..., None].expand(-1, -1, count) for part in positions]
     return torch.cat(positions, 1)
 
 

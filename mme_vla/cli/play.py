@@ -13,6 +13,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.config.composition import plain
 from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.episodes import named_tasks
+from mme_vla.envs.metadata import step_limit
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
@@ -43,6 +44,8 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
     specs = choose_episodes(named_tasks(config), config["episodes"], config["split"])
+    if config["max_steps"] is None:
+        config["max_steps"] = step_limit(config["split"])
     settings: dict[str, Any] = asdict(read_section(PlaySettings, config, others=True))
     settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
     human = player["name"] == HUMAN

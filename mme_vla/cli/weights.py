@@ -22,7 +22,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
 from mme_vla.weights.load import adapter_of, read_as
-from mme_vla.weights.source import FORMATS, Source, open_source
+from mme_vla.weights.source import FORMATS, METHOD_FORMATS, Source, open_source
 from mme_vla.weights.statistics import read_stats
 from mme_vla.weights.tables import Adapter
 from mme_vla.weights.writers import check_target, write_policy
@@ -194,4 +194,7 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         words.append(f"backbone={compose('policy', words).full_size}")
     from mme_vla.policy.build import build_from_config
 
-    return build_from_config(compose("policy", words), device="meta")
+    composed = compose("policy", words)
+    if (of := METHOD_FORMATS.get(opened.format)) is not None and of.configure is not None:
+        composed = of.function("configure")(composed, opened.config, opened.folder)
+    return build_from_config(composed, device="meta")

@@ -63,7 +63,7 @@ def join_memories(cfg: DictConfig) -> DictConfig:
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-FREE = ("memory.budget", "processor.tokenizer", "processor.text", "processor.side")
+FREE = ("memory.budget", "processor.tokenizer", "processor.text", "processor.side", "processor.max_words")
 """Keys in them that do not: a budget has a field of its own in records; pixels and words go with the backbone."""
 POLICY, DEFAULT_POLICY = "policy.name", "mme"
 LONGEST = 32  # Letters that differences may take in a name; more are a digest

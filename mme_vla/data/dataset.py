@@ -149,6 +149,12 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             f"The prompt format {spec.name!r} reads the notes {listed(lacking)}: name their columns, such as "
             f"data.texts={{{lacking[0] if lacking else ''}: simple_subgoal}}.",
         )
+        rate = processor.embodiment.fps
+        if processor.samples.history is not None and (other := [s for s in sources if rate not in (None, s.fps)]):
+            raise UserError(
+                f"{other[0].name} has {other[0].fps:g} frames per second and embodiment.fps={rate:g}: the video would "
+                "be shown at another speed than it is read at. Convert the data to that rate, or set embodiment.fps."
+            )
         self.sources, self.processor, self.memory = list(sources), processor, memory
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
@@ -282,8 +288,14 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         window = np.arange(step.index - self.processor.samples.window + 1, step.index + 1).clip(min=0)
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)
+        history, memory_camera = self.processor.samples.history, source.robot.memory_camera
+        views = {}
+        for name in cameras:
+            frames = history(step.index) if history is not None and name == memory_camera else window
+            distinct, places = np.unique(frames, return_inverse=True)
+            views[name] = source.frames(step.episode, distinct, name)[places]
         return Sample(
-            views={name: source.frames(step.episode, window, name) for name in cameras},
+            views=views,
             states=states[window - first],
             goal=source.robot.action.worded(step.goal, source.options(step.episode)),
             subgoal=subgoal,

@@ -129,8 +129,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         memory: MemoryModule | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
-        check_integrated(config, integration, memory, backbone_cls.supports)
+        cls._check_parts(config, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
+
+    _check_parts = staticmethod(check_integrated)
 
     # Training
 

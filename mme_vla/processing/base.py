@@ -1,7 +1,7 @@
 """`PolicyProcessor`: the interface between raw data and one kind of network."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
@@ -56,6 +56,8 @@ class SampleSpec:
     full_chunks_only: leave out steps with fewer recorded actions ahead than a chunk has.
     group_size: steps of one episode in a sample; more than 1 for policies that train on sequences.
     cameras: whose images an item holds, in the embodiment's order; None for all.
+    history: from a step to the frames of the memory camera that an item holds, the current one last; the other cameras
+        then have the current image alone. None for the window of all cameras.
     """
 
     kind: str = "steps"
@@ -64,6 +66,7 @@ class SampleSpec:
     full_chunks_only: bool = False
     group_size: int = 1
     cameras: tuple[str, ...] | None = None
+    history: Callable[[int], np.ndarray] | None = None
 
 
 @dataclass(frozen=True)

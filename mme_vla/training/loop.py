@@ -22,7 +22,7 @@ from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoin
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
-from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
+from mme_vla.training.optim import EMA, clip_gradients, lr_factors, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, Collate, Samples, Validation, generator_for, readers, seed_of, size_of
 from mme_vla.training.parallel import full_value, gathered, reshard, shard
 from mme_vla.training.runs import PLOT, SUMMARY, Run
@@ -109,7 +109,8 @@ class Trainer:
             mesh = settings.parallel.mesh(accelerator.device.type)
             shard(policy, mesh, policy.compute_dtype, settings.compile)
         parameters = trainable(policy)
-        self.optimizer = make_optimizer(parameters.values(), settings)
+        factors = lr_factors(parameters, policy.finetune_spec, settings)
+        self.optimizer = make_optimizer(parameters.values(), settings, factors)
         self.ema = EMA(parameters, settings.ema, settings.ema_warmup, partial(reshard, policy))
         if run.checkpoint is not None:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
@@ -167,7 +168,7 @@ class Trainer:
         settings, device = self.settings, self.accelerator.device
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group.get("lr_factor", 1.0)
         draws = self.policy.training_noise(settings.batch_size, generator_for(settings.seed, "train", step))
         # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)

@@ -1,7 +1,7 @@
 """AdamW, warm-up, schedule, clipping: the released recipes, number by number."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.training.parallel import like
 from mme_vla.training.settings import TrainSettings
 
@@ -40,16 +42,33 @@ def scheduled_rate(step: int, settings: TrainSettings) -> float:
     return peak
 
 
-def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) -> torch.optim.Optimizer:
+def lr_factors(names: Iterable[str], spec: FineTuneSpec, settings: TrainSettings) -> list[float]:
+    """Factors of the learning rate of parameters, by their component (`train.part_lr`)."""
+    for part in settings.part_lr:
+        if part not in spec.components:
+            raise UserError(f"train.part_lr names {part!r}. {did_you_mean(part, spec.components)}")
+    return [settings.part_lr.get(spec.component_of(name), 1.0) for name in names]
+
+
+def make_optimizer(
+    parameters: Iterable[nn.Parameter], settings: TrainSettings, factors: Sequence[float] | None = None
+) -> torch.optim.Optimizer:
     """AdamW over all trainable parameters, fused, which every device that trains supports; or timm's LAMB.
 
     LAMB scales each tensor's update down to that tensor's norm, never up. Parameters of fewer than `decay_min_dim`
     dimensions (biases, norms) are a group of their own, without weight decay.
+
+    Args:
+        factors: of each parameter's learning rate, of `lr_factors`; a group keeps its own as `lr_factor`. None: all 1.
     """
     parameters_list, least = list(parameters), settings.decay_min_dim
-    decayed: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim >= least]}
-    others: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim < least], "weight_decay": 0.0}
-    groups = [group for group in (decayed, others) if group["params"]]
+    members: dict[tuple[float, bool], list[nn.Parameter]] = {}
+    for parameter, factor in zip(parameters_list, factors or [1.0] * len(parameters_list), strict=True):
+        members.setdefault((factor, parameter.ndim >= least), []).append(parameter)
+    groups: list[dict[str, Any]] = [
+        {"params": group} | ({} if decays else {"weight_decay": 0.0}) | ({} if factor == 1 else {"lr_factor": factor})
+        for (factor, decays), group in sorted(members.items(), key=lambda item: (-item[0][0], -item[0][1]))
+    ]
     if settings.optimizer == "lamb":
         from mme_vla.training.lamb import ClippedLamb  # imports timm, and so torchvision
 

@@ -31,6 +31,7 @@ class TrainSettings:
     weight_decay: NonNegative = 1e-10
     clip_norm: Positive = 1.0
     ema: float = 0.999
+    part_lr: Mapping[str, Positive] = field(default_factory=dict)
     optimizer: Literal["adamw", "lamb"] = "adamw"
     warmup_from_zero: bool = False
     schedule: Literal["constant", "cosine", "steps"] = "constant"

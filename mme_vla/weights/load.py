@@ -90,6 +90,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
         return merge_state(source.tensors(), source.config.get("adapters"))
     if source.format == "lerobot":
         check_window(policy, source.config, str(source.folder))
+    if (of := METHOD_FORMATS.get(source.format)) is not None and of.check is not None:
+        of.function("check")(policy, source.config, str(source.folder))
     adapter, state = adapter_of(source.format, policy), policy.state_dict()
     tensors = source.tensors(lambda values: adapter.check_fit(values, state, source.label))
     return adapter.translate(tensors, state, source.label)

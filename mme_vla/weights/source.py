@@ -33,6 +33,7 @@ FORMATS = {
     "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
     "openvla": "OpenVLA, or a run of OpenVLA-OFT, merged or beside its base (safetensors, with .pt files)",
     "memoryvla": "MemoryVLA as its authors train it (.pt)",
+    "simplememvla": "SimpleMemVLA as its authors publish it, or Qwen3.5 (safetensors)",
 }
 
 
@@ -42,6 +43,8 @@ class MethodFormat:
 
     matches: whether tensor names are its. adapter: its name table for a policy. write: a policy as its files.
     native: tensors under the one spelling of the name table, for files of `torch.save`. stats: reads its statistics.
+    spelling: the same for safetensors. check: compares its config.json with a policy. configure: a composed
+        configuration as its config.json says.
     """
 
     module: str
@@ -50,6 +53,9 @@ class MethodFormat:
     write: str
     native: str | None = None
     stats: str | None = None
+    spelling: str | None = None
+    check: str | None = None
+    configure: str | None = None
 
     def function(self, role: str) -> Callable[..., Any]:
         name: str = getattr(self, role)
@@ -58,6 +64,10 @@ class MethodFormat:
 
 
 METHOD_FORMATS = {
+    "simplememvla": MethodFormat(
+        "mme_vla.methods.simplememvla.weights", "is_simplememvla", "simplememvla_adapter", "write_simplememvla",
+        stats="read_published_stats", spelling="read_names", check="check_config", configure="configured",
+    ),
     "diffusion_policy": MethodFormat(
         "mme_vla.methods.diffusion_policy.weights", "is_diffusion_policy", "diffusion_adapter",
         "write_diffusion_policy", native="unwrap_names", stats="read_diffusion_stats",
@@ -128,6 +138,9 @@ class Source:
         tensors = read_files(self.folder, self.files)
         if self.format == "openvla":
             tensors = _openvla().with_heads(tensors, self.folder)
+        if (of := METHOD_FORMATS.get(self.format)) is not None and of.spelling is not None:
+            spelled: dict[str, Tensor] = of.function("spelling")(tensors, str(self.folder))
+            return spelled
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
@@ -142,7 +155,7 @@ class Source:
     @property
     def model(self) -> str | None:
         """Our name of the variant a checkpoint is, or None where it does not say."""
-        if self.format in NATIVE_FORMATS:
+        if self.format in (*NATIVE_FORMATS, "simplememvla"):
             return self.format
         if self.format == "openvla":
             return "openvla_oft"
@@ -231,8 +244,12 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         lerobot = any(name.startswith(LEROBOT_PREFIX) for name in names)
         described = Source("lerobot", folder).config.get("type") is not None
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
+    is_ours = "backbone" in Source("ours", folder).config
+    has_qwen = any(name.endswith("model.visual.pos_embed.weight") for name in names)
+    if not is_ours and has_qwen and METHOD_FORMATS["simplememvla"].function("matches")(names):
+        return Source("simplememvla", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
-    if any(name.startswith("backbone.") for name in names) or "backbone" in Source("ours", folder).config:
+    if any(name.startswith("backbone.") for name in names) or is_ours:
         return Source("ours", folder, files)
     if METHOD_FORMATS["openvla"].function("matches")(names):
         return Source("openvla", folder, files)

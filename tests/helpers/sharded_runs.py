@@ -38,7 +38,10 @@ from mme_vla.training.shards import shard_files
 
 RUNS = [(2, "train,stop,policies,die"), (1, "go_on"), (3, "resume"), (1, "whole")]
 """How many processes do what one after the other; starting them takes longer than what they do, so few do much."""
-MODELS = ("tokendrop_expert", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus")
+MODELS = (
+    "tokendrop_expert", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus",
+    "simplememvla",
+)  # fmt: skip
 SHARDED = {"parallel": {"strategy": "fsdp"}}
 BATCH = 6  # of two and of three processes
 
@@ -197,7 +200,13 @@ def rank(number: int, processes: int, port: int, what: str, folder: Path) -> Non
 
 def prepare() -> None:
     """Import and compose what the processes would each for themselves."""
-    for module in ("diffusers", "torchvision", "timm", "transformers.models.llama.modeling_llama"):
+    for module in (
+        "diffusers",
+        "torchvision",
+        "timm",
+        "transformers.models.llama.modeling_llama",
+        "transformers.models.qwen3_5.modeling_qwen3_5",
+    ):
         importlib.import_module(module)
     for name in (*MODELS, "framesamp_modul"):
         build_policy(name, device="meta", policy={"compute_dtype": "float32", "augment": False})

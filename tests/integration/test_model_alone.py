@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import REPOSITORY
+from helpers import REPOSITORY
 
 THIRD_PARTY = {"torch", "numpy", "einops", "timm"}
 MAX_MODULES = 25

@@ -42,7 +42,13 @@ SHORT = {
     },
     "memoryvla": [*LLAMA, "backbone.vision.image_size=28", "backbone.head.depth=1", "processor.group_size=3"],
     "sam2act_plus": ["train.warmup=1"],
-}
+    "simplememvla": [
+        "processor.max_words=4", "processor.seconds=4", "backbone.head.depth=1",
+        "backbone.vlm.vision_config.depth=1", "backbone.vlm.text_config.num_hidden_layers=2",
+        "backbone.vlm.text_config.full_attention_interval=2",
+    ],
+}  # fmt: skip
+PAPER_ROWS = [model for model in SHORT if model != "simplememvla"]
 pytestmark = pytest.mark.filterwarnings("ignore:.*loses its end")
 
 
@@ -230,7 +236,7 @@ def test_a_sam2act_episode_ends_after_its_waypoints(loaded: Callable[[str], Poli
     assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 3, 3 * DepthEnv.motion)
 
 
-@pytest.mark.parametrize("model", SHORT)
+@pytest.mark.parametrize("model", PAPER_ROWS)
 def test_it_is_explained_by_inspect_and_stands_beside_its_paper_row(model: str, trained: Callable[[str], Path]) -> None:
     console = Console(record=True, width=200, file=io.StringIO())
     show_checkpoint(trained(model), console)
