@@ -21,14 +21,16 @@ Shapes: b batch · n tokens · d width · v views · h action horizon · a actio
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Backbone, Injection
+from mme_vla.backbone.base import AuxiliaryLosses, Backbone, Injection, KeepsKeysValues
+from mme_vla.errors import check_known, require
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens, Noise
+from mme_vla.types import Batch, HistoryTokens, KeysValues, MemoryTokens, Noise
 
 
 class MMEModel(nn.Module):
@@ -45,6 +47,9 @@ class MMEModel(nn.Module):
     >>> memory = FrameSamp(backbone.vision_width, integration.memory_width)  # doctest: +SKIP
     >>> model = MMEModel(backbone, memory, integration)  # doctest: +SKIP
     """
+
+    loss_weights: Mapping[str, float] = MappingProxyType({})
+    """Weights of auxiliary losses by name (`train.losses`); 1 for those that are not named."""
 
     def __init__(
         self,
@@ -64,18 +69,60 @@ class MMEModel(nn.Module):
         memory: MemoryTokens | None = None,
         augmentation: Tensor | None = None,
     ) -> Tensor:
-        """The mean loss of a batch.
+        """The mean loss of a batch: that of the actions, and in training the weighted auxiliary ones.
 
         Args:
             batch: with `actions`, on the model's device. noise: as `training_noise` makes it, on that device.
             memory: memory tokens; by default those of `batch.history`.
             augmentation: random numbers [b, …] of the image augmentation; None leaves images as they are.
         """
+        return self.total_loss(self.losses(batch, noise, memory, augmentation))
+
+    def losses(
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        memory: MemoryTokens | None = None,
+        augmentation: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """The mean losses of a batch by name: `action`, and in training those of memory, integration and backbone.
+
+        The arguments are those of `loss`.
+        """
         batch = self.prepare_images(batch, augmentation)
         with self.autocast():
             memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
-            losses = self.backbone.loss(batch, self.inject(batch, memory), noise)  # b h
-        return masked_mean(losses, batch.action_mask)
+            injection = self.inject(batch, memory)
+            losses = self.backbone.loss(batch, injection, noise)  # b h
+            auxiliary = self.auxiliary_losses(batch, injection, memory) if self.training else {}
+        means = {name: weighted_mean(rows.float(), batch.weight) for name, rows in auxiliary.items()}
+        return {"action": masked_mean(losses, batch.action_mask, batch.weight), **means}
+
+    def auxiliary_losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, Tensor]:
+        """Losses [b] by name that memory, integration and backbone return beside that of the actions."""
+        rows = {} if memory is None else dict(memory.losses)
+        for part in (self.integration, self.backbone):
+            if isinstance(part, AuxiliaryLosses):
+                rows |= part.losses(batch, injection, memory)
+        for name, values in rows.items():
+            require(
+                name != "action" and values.shape == (len(batch.prompt),),
+                f"The auxiliary loss {name!r} has shape {list(values.shape)}: return one number a sample, "
+                f"[{len(batch.prompt)}], under another name than 'action'.",
+                ValueError,
+            )
+        return rows
+
+    def total_loss(self, losses: Mapping[str, Tensor]) -> Tensor:
+        """The loss that training minimises: `action`, and the others times their weights. Weight 0 leaves one out."""
+        total = losses["action"]
+        for name, value in losses.items():
+            if name != "action" and (weight := self.loss_weights.get(name, 1.0)):
+                total = total + weight * value
+        if self.training:
+            for name in self.loss_weights:
+                check_known("auxiliary loss in train.losses:", name, [key for key in losses if key != "action"])
+        return total
 
     @torch.no_grad()
     def sample(
@@ -92,6 +139,16 @@ class MMEModel(nn.Module):
             memory = self.encode_memory(self.conditioned_history(batch)) if memory is None else memory
             batch = self.prepare_images(batch)
             return self.backbone.sample(batch, self.inject(batch, memory), noise, steps)
+
+    @torch.no_grad()
+    def sample_and_keep(
+        self, batch: Batch, noise: Mapping[str, Tensor], steps: int | None = None, memory: MemoryTokens | None = None
+    ) -> tuple[Tensor, KeysValues]:
+        """A chunk as `sample` returns it, and the keys and values that the backbone made of its prefix."""
+        assert isinstance(self.backbone, KeepsKeysValues)
+        with self.autocast():
+            batch = self.prepare_images(batch)
+            return self.backbone.sample_and_keep(batch, self.inject(batch, memory), noise, steps)
 
     # The steps, in order
 
@@ -148,13 +205,18 @@ class MMEModel(nn.Module):
         return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
 
-def masked_mean(losses: Tensor, counted: Tensor | None) -> Tensor:
+def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = None) -> Tensor:
     """The mean of losses [b, h], over the counted steps of each sample first, so that it is independent of the batch.
 
     Args:
-        counted: [b, h] bool; None counts all (`data.mask_padding`).
+        counted: [b, h] bool; None counts all (`data.mask_padding`). weight: of each sample, [b] (`data.weights`).
     """
     if counted is None:
-        return losses.mean()
+        return losses.mean() if weight is None else weighted_mean(losses.mean(1), weight)
     weights = counted.to(losses.dtype)
-    return ((losses * weights).sum(1) / weights.sum(1).clamp(min=1)).mean()
+    return weighted_mean((losses * weights).sum(1) / weights.sum(1).clamp(min=1), weight)
+
+
+def weighted_mean(losses: Tensor, weight: Tensor | None) -> Tensor:
+    """The mean over a batch of each sample's loss [b] times its weight [b]; None weighs all with 1."""
+    return losses.mean() if weight is None else (losses * weight).mean()

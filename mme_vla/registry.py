@@ -143,6 +143,13 @@ SUBGOALS: Registry[Any] = Registry(
         "openai": "mme_vla.subgoal.gemini",
     },
 )
+PROMPTS: Registry[Any] = Registry(
+    "prompt format",
+    dict.fromkeys(
+        ("plain", "state", "subgoal", "subgoal_sentence", "past_actions", "openvla", "openvla_subgoal"),
+        "mme_vla.processing.prompt",
+    ),
+)
 TASKS: Registry[Any] = Registry("task")
 PLAYERS: Registry[Any] = Registry(
     "player",
@@ -161,7 +168,7 @@ REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
     "intervention": INTERVENTIONS, "reward": REWARDS,
-    "history_transform": HISTORY_TRANSFORMS,
+    "history_transform": HISTORY_TRANSFORMS, "prompt": PROMPTS,
 }  # fmt: skip
 
 
@@ -170,7 +177,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe), `reward` or `history_transform`.
+            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe), `reward`, `history_transform` or
+            `prompt` (a prompt format).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

@@ -39,8 +39,12 @@ def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -
     return {name: change(value) for name, value in noise.items()}
 
 
+class Labels(dict[str, Tensor]):
+    """Labels by name, each [b, …]. Inside a `TensorStruct` they move with it."""
+
+
 class TensorStruct:
-    """A dataclass of tensors (or nested structs, or None) that moves between devices as one."""
+    """A dataclass of tensors (or nested structs, labels, or None) that moves between devices as one."""
 
     def _map(self, fn: Any) -> Self:
         values = {}
@@ -50,6 +54,8 @@ class TensorStruct:
                 values[member.name] = fn(value)
             elif isinstance(value, TensorStruct):
                 values[member.name] = value._map(fn)
+            elif isinstance(value, Labels):
+                values[member.name] = Labels({name: fn(label) for name, label in value.items()})
             else:
                 values[member.name] = value
         return type(self)(**values)
@@ -78,6 +84,8 @@ class TensorStruct:
                 yield value
             elif isinstance(value, TensorStruct):
                 yield from value.tensors()
+            elif isinstance(value, Labels):
+                yield from value.values()
 
 
 @dataclass(frozen=True)
@@ -116,12 +124,15 @@ class HistoryTokens(TensorStruct):
         video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.
     step: [b] int64; the current frame, counted like the others. None where it is not needed.
+    labels: in training, the labels of each token's frame that the memory reads (`ReadsLabels`), each [b, n] or
+        [b, n, k] float32, 0 on padding. Empty in episodes.
     """
 
     features: Tensor
     positions: Tensor
     mask: Tensor
     step: Tensor | None = None
+    labels: Labels = field(default_factory=Labels)
 
     @property
     def ages(self) -> Tensor | None:
@@ -132,6 +143,35 @@ class HistoryTokens(TensorStruct):
 
 
 @dataclass
+class KeysValues(TensorStruct):
+    """Keys, rotated, and values of all layers of a backbone, K heads of h numbers each.
+
+    values: [b, layers, 2, n, K, h]; keys first. mask: [b, n] bool; False on padding.
+    """
+
+    values: Tensor
+    mask: Tensor
+
+    def entry(self, row: int) -> Tensor:
+        """The valid tokens of one sample, [layers, 2, n, K, h]."""
+        return self.values[row][:, :, self.mask[row]]
+
+    @classmethod
+    def stack(cls, samples: Sequence[Sequence[Tensor]]) -> Self | None:
+        """The entries of each of b samples, one after the other, padded to one length; None if there is none."""
+        if not (every := [entry for entries in samples for entry in entries]):
+            return None
+        lengths = [sum(entry.shape[2] for entry in entries) for entries in samples]
+        first = every[0]
+        values = first.new_zeros(len(samples), *first.shape[:2], max(lengths), *first.shape[3:])
+        for row, entries, length in zip(values, samples, lengths, strict=True):
+            if length:
+                row[:, :, :length] = torch.cat(list(entries), 2)
+        mask = torch.arange(max(lengths)) < torch.tensor(lengths)[:, None]
+        return cls(values, mask.to(values.device))
+
+
+@dataclass
 class MemoryTokens(TensorStruct):
     """What every neural memory hands over: at most `budget` valid tokens.
 
@@ -139,12 +179,16 @@ class MemoryTokens(TensorStruct):
     metrics: scalars a memory reports of how it came to these tokens, detached.
     ages: [b, budget] float32; how many frames ago the moment was that a token speaks of. None where tokens have no
         moment, or the selection did not say what the current frame is.
+    losses: auxiliary losses by name, each [b], with gradients. Only training reads them (`train.losses`).
+    cache: stored keys and values of earlier chunks (`CacheMemory`); None in training, and before the first chunk.
     """
 
     tokens: Tensor
     mask: Tensor
     metrics: dict[str, Tensor] = field(default_factory=dict)
     ages: Tensor | None = None
+    losses: dict[str, Tensor] = field(default_factory=dict)
+    cache: KeysValues | None = None
 
 
 @dataclass
@@ -189,6 +233,8 @@ class Batch(TensorStruct):
     overlap: what a sampled chunk is to agree with; None where it is free.
     past: past views that a memory gives along with the current ones; None for all others.
     options: [b, letters] bool; the letters offered to a policy that chooses among options. None means all.
+    weight: [b] float32; multiplies each sample's loss (`data.weights`). None counts all alike.
+    labels: in training, labels of the current frame (`ReadsLabels` of integration and backbone).
     """
 
     images: Tensor
@@ -204,6 +250,8 @@ class Batch(TensorStruct):
     overlap: Overlap | None = None
     past: PastViews | None = None
     options: Tensor | None = None
+    weight: Tensor | None = None
+    labels: Labels = field(default_factory=Labels)
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.
@@ -214,3 +262,19 @@ class Batch(TensorStruct):
         longest = int(self.prompt_mask.sum(1).max())
         length = min(-(-longest // multiple) * multiple, self.prompt.shape[1])
         return replace(self, prompt=self.prompt[:, :length], prompt_mask=self.prompt_mask[:, :length])
+
+
+class ReadsLabels:
+    """Capability of a memory, an integration or a backbone: it learns from labels of the dataset.
+
+    reads_labels: columns of numbers in the dataset, or `subtask_boundary` (1 where a sub-task begins, else 0).
+        A memory has them by frame in `HistoryTokens.labels`, the others of the current frame in `Batch.labels`.
+    """
+
+    reads_labels: Sequence[str] = ()
+
+
+def labels_read(*parts: object) -> tuple[str, ...]:
+    """Names of the labels that some parts of a policy read, each once."""
+    names = (name for part in parts if isinstance(part, ReadsLabels) for name in part.reads_labels)
+    return tuple(dict.fromkeys(names))

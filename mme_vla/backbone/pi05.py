@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection, KeepsKeysValues
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
@@ -16,7 +16,7 @@ from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, check_backend, f
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recompute, Recomputes, Sharded
-from mme_vla.types import Batch, Noise, PastViews
+from mme_vla.types import Batch, KeysValues, Noise, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.speed.sharding import ShardGroup
@@ -32,6 +32,7 @@ class Pi05Backbone(
     Recomputes,
     Sharded,
     CapturableSampling,
+    KeepsKeysValues,
 ):
     """Vision tower, VLM expert and action expert under joint attention; chunks by flow matching.
 
@@ -39,7 +40,7 @@ class Pi05Backbone(
     """
 
     Config = BackboneConfig
-    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
+    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "cache", "past"})
     heads = ("action_in", "action_out", "time_in", "time_out")
     # The VLM's last layer has `kv` in place of `qkv`.
     lora_targets = tuple(
@@ -142,10 +143,11 @@ class Pi05Backbone(
     def velocity(self, injection: Injection, x_t: Tensor, time: Tensor) -> Tensor:
         """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
-        layout = self.transformer.layout(blocks, injection.visibility)
+        past = KVCache.of(injection.past)
+        layout = self.transformer.layout(blocks, injection.visibility, past)
         condition = self.time_condition(time)
         condition = condition if injection.condition is None else injection.condition(condition)
-        hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past)
         return self.read_velocity(hidden)
 
     # Sampling
@@ -163,8 +165,19 @@ class Pi05Backbone(
         All that does not depend on the flow time is computed once: memory, keys and values of the prefix and of the
         modulator, and every layer's time modulation. A step runs the action block alone.
         """
-        x, steps = noise["noise"], self.head.steps if steps is None else steps
+        return self._integrate(batch, injection, noise, steps, self.prefill(injection))
+
+    @torch.no_grad()
+    def sample_and_keep(
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
+    ) -> tuple[Tensor, KeysValues]:
         prefix = self.prefill(injection)
+        return self._integrate(batch, injection, noise, steps, prefix), prefix.new()
+
+    def _integrate(
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None, prefix: KVCache
+    ) -> Tensor:
+        x, steps = noise["noise"], self.head.steps if steps is None else steps
         blocks = [*injection.beside, self.action_block(x)]
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
         past = prefix.preallocate(sum(map(len, blocks)))
@@ -182,8 +195,9 @@ class Pi05Backbone(
 
     def prefill(self, injection: Injection) -> KVCache:
         """Keys and values of the prefix, which all steps of a chunk share."""
-        layout = self.transformer.layout(injection.blocks, injection.visibility)
-        _, prefix = self.transformer(injection.blocks, layout, keep=True)
+        past = KVCache.of(injection.past)
+        layout = self.transformer.layout(injection.blocks, injection.visibility, past)
+        _, prefix = self.transformer(injection.blocks, layout, past=past, keep=True)
         return prefix
 
     def denoise(

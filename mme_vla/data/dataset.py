@@ -1,7 +1,7 @@
 """The training dataset: one item is one step of an execution phase."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -11,8 +11,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
+from mme_vla.data.columns import label_column, text_column, weight_column
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, listed, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
 from mme_vla.memory.history import History
 from mme_vla.memory.transforms import FrameMap, HistoryTransform, TransformedHistory, map_frames
@@ -20,6 +21,7 @@ from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.types import HistoryTokens, Labels, labels_read
 
 TRANSFORMS = 1  # The stream of random numbers of an item that transforms read
 
@@ -45,6 +47,52 @@ class Step:
     recorded: np.ndarray
 
 
+class FurtherColumns:
+    """Labels, sample weights and texts of one dataset, read and checked once; see `TrainingDataset`."""
+
+    def __init__(
+        self,
+        source: EpisodeSource,
+        labels: Sequence[str],
+        memory_labels: Sequence[str],
+        weights: str | None,
+        texts: Mapping[str, str],
+    ) -> None:
+        key = "The policy's labels"
+        self._source, self._memory_labels = source, tuple(memory_labels)
+        self._labels = {name: label_column(source, name, key) for name in dict.fromkeys((*labels, *memory_labels))}
+        self._current = tuple(labels)
+        self._weights = None if weights is None else weight_column(source, weights)
+        self._texts = {note: text_column(source, column) for note, column in texts.items()}
+
+    def items(self, episode: int, frame: int) -> dict[str, Any]:
+        """What a sample at a frame has of these: `labels` and `weight`, where there are any."""
+        (row,) = self._source.rows(episode, np.array([frame]))
+        labels = {name: torch.as_tensor(self._labels[name][row]) for name in self._current}
+        weight = {} if self._weights is None else {"weight": torch.as_tensor(self._weights[row])}
+        return ({"labels": labels} if labels else {}) | weight
+
+    def text(self, note: str, episode: int, frame: int) -> str:
+        """The text of a note at a frame."""
+        (row,) = self._source.rows(episode, np.array([frame]))
+        return str(self._texts[note][int(row)].as_py())
+
+    def with_labels(self, episode: int, selection: HistoryTokens, real: np.ndarray | None = None) -> HistoryTokens:
+        """A selection, unbatched, with the labels of each token's frame that the memory reads.
+
+        real: the recorded frame of each frame of a transformed episode (`FrameMap.real`).
+        """
+        if not self._memory_labels:
+            return selection
+        frames = (selection.positions[:, 0] * selection.mask).numpy()
+        rows = self._source.rows(episode, frames if real is None else real[frames.astype(np.int64)])
+        labels = Labels()
+        for name in self._memory_labels:
+            values = torch.from_numpy(self._labels[name][rows])
+            labels[name] = values * selection.mask.view(-1, *[1] * (values.ndim - 1))
+        return replace(selection, labels=labels)
+
+
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
@@ -66,6 +114,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         mask_padding: bool = False,
         jitter: bool = False,
         subgoal: SubgoalText | None = None,
+        labels: Sequence[str] = (),
+        weights: str | None = None,
+        texts: Mapping[str, str] | None = None,
         seed: int = 42,
         transforms: Sequence[HistoryTransform] = (),
     ) -> None:
@@ -82,6 +133,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             mask_padding: leave repeated actions past the end of an episode out of the loss (released: they count).
             jitter: hand the memory a random generator, for memories that vary their selection in training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
+            labels: of the current frame, that integration and backbone read; those of the memory follow from it.
+            weights: the column of sample weights. texts: note of the prompt → its column of texts.
             seed: of all randomness.
             transforms: of the frames of an episode, before anything reads its past.
         """
@@ -99,6 +152,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
         if subgoal is not None:
             _check_subgoals(sources, subgoal)
+        spec = processor.prompt_spec
+        lacking = sorted(set(spec.notes) - set(texts or {}))
+        require(
+            not lacking,
+            f"The prompt format {spec.name!r} reads the notes {listed(lacking)}: name their columns, such as "
+            f"data.texts={{{lacking[0] if lacking else ''}: simple_subgoal}}.",
+        )
         rate = processor.embodiment.fps
         if processor.samples.history is not None and (other := [s for s in sources if rate not in (None, s.fps)]):
             raise UserError(
@@ -110,6 +170,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.action_offset, self.mask_padding = action_offset, mask_padding
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
         self.transforms = tuple(transforms)
+        self.columns = [FurtherColumns(source, labels, labels_read(memory), weights, texts or {}) for source in sources]
         selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(selected)]).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
@@ -232,6 +293,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         item = self.processor.item(self._sample(step, subgoal, now, frames))
         if self.mask_padding:
             item["action_mask"] = torch.from_numpy(step.recorded)
+        for name, value in self.columns[step.source].items(step.episode, step.index).items():
+            item[name] = item.get(name, {}) | value if name == "labels" else value
         if self.memory is not None:
             history: History = self.caches[step.source].history(step.episode)
             if uses_proprio(self.memory):
@@ -239,7 +302,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                 history.state_width = self.processor.embodiment.state.width
             if frames is not None:
                 history = TransformedHistory(history, frames)
-            item["history"] = self.memory.gather_selection(history, now, rng if self.jitter else None)
+            selection = self.memory.gather_selection(history, now, rng if self.jitter else None)
+            real = None if frames is None else frames.real
+            item["history"] = self.columns[step.source].with_labels(step.episode, selection, real)
             if (spec := past_view_spec(self.memory)) is not None:
                 read = partial(self._images, step.source, step.episode, frames)
                 item["past"] = past_views(spec, now, read, self.processor.images)
@@ -266,8 +331,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         history, memory_camera = self.processor.samples.history, source.robot.memory_camera
         views = {}
         for name in cameras:
-            frames = history(step.index) if history is not None and name == memory_camera else window
-            distinct, places = np.unique(frames, return_inverse=True)
+            read = window
+            if history is not None and name == memory_camera:
+                read = history(now) if frames is None else frames.real[history(now)]
+            distinct, places = np.unique(read, return_inverse=True)
             views[name] = source.frames(step.episode, distinct, name)[places]
         return Sample(
             views=views,
@@ -276,7 +343,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             subgoal=subgoal,
             past_actions=self.past_actions(step, frames),
             actions=step.actions,
+            **self._notes(step),
         )
+
+    def _notes(self, step: Step) -> dict[str, dict[str, str]]:
+        """Notes of the prompt, and the lines to write; one that the policy writes is read a decision later."""
+        spec, columns = self.processor.prompt_spec, self.columns[step.source]
+        before = step.index - self.processor.embodiment.action.execute
+        notes = {name: columns.text(name, step.episode, step.index) for name in spec.notes}
+        written = {name: notes[name] for name in spec.writes}
+        for name in written:
+            notes[name] = columns.text(name, step.episode, before) if before >= step.exec_start else ""
+        return {"notes": notes, "written": written}
 
 
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:

@@ -144,6 +144,10 @@ class EpisodeSource:
         episode = int(np.searchsorted(self._starts, row, side="right")) - 1
         return episode, row - int(self._starts[episode])
 
+    def rows(self, episode: int, frames: np.ndarray) -> np.ndarray:
+        """Rows of the tables that hold frames [n] of an episode, int64 [n]: the inverse of `locate`."""
+        return int(self._starts[episode]) + np.asarray(frames, np.int64)
+
     def task(self, episode: int) -> str:
         """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
         task = self.records[episode].get("task", "") if episode < len(self.records) else ""

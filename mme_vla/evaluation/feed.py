@@ -14,7 +14,7 @@ from mme_vla.evaluation.recordings import Recording, stored_frames
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.transforms import HistoryTransform, map_frames
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, frames_read, with_vision_memory
+from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, WritesNotes, frames_read, with_vision_memory
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.types import Noise
 
@@ -98,6 +98,7 @@ class FedEpisode(Episode):
         super().__init__(host, goal, seed)
         self._host, self.seed = host, seed
         self.inner = host.inner.start_episode(goal, seed)
+        self.notes, self.written = self.inner.notes, self.inner.written
         self.exec_start: int | None = None
         self._counts: np.ndarray = np.zeros(0, np.int64)
         self._starts: np.ndarray = np.zeros(0, np.int64)
@@ -164,8 +165,8 @@ class FedEpisode(Episode):
     def state(self) -> Tensor:
         return self.inner.state
 
-    def acted(self, chunk: np.ndarray) -> None:
-        self.inner.acted(chunk)
+    def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
+        self.inner.acted(chunk, notes)
 
     def add_frames(self, *_: Any, **__: Any) -> None:
         """Not offered: a feed decides on whole observations."""
@@ -240,6 +241,10 @@ class FedPolicy(Policy):
         self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         return self.inner.predict_chunk(batch, [inner_episode(episode) for episode in episodes], draws, steps)
+
+    def write_notes(self, batch: Any, episodes: Sequence[Episode]) -> Sequence[Mapping[str, str]]:
+        inner = [inner_episode(episode) for episode in episodes]
+        return self.inner.write_notes(batch, inner) if isinstance(self.inner, WritesNotes) else [{} for _ in inner]
 
 
 def inner_episode(episode: Episode) -> Episode:

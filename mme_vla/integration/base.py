@@ -9,7 +9,7 @@ from mme_vla.backbone.base import Hook, Injection
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.layers import PI05_VISIBILITY, Block, Visibility
 from mme_vla.errors import check_choice
-from mme_vla.types import MemoryTokens
+from mme_vla.types import KeysValues, MemoryTokens
 
 MEMORY_VISIBILITY: Visibility = {
     "memory": {"memory"},
@@ -45,6 +45,7 @@ class Integration(nn.Module):
         hook: the action expert's per-layer hook for this chunk, with all that depends on memory alone computed now.
         condition: what becomes of the condition of the action expert's norms (the embedded flow time).
         beside: blocks that stand beside the actions in every step; `visibility` needs rows for them.
+        past: stored keys and values, which the blocks read whose row of `visibility` names `cache`.
         required_features: what a backbone must support beside the methods overridden here (`Backbone.supports`).
         memory_position: `time` where its attention on memory counts frames, which needs a memory whose tokens tell
             their ages; `slot` where it counts tokens.
@@ -73,11 +74,14 @@ class Integration(nn.Module):
     def beside(self, memory: MemoryTokens | None) -> Sequence[Block]:
         return ()
 
+    def past(self, memory: MemoryTokens | None) -> KeysValues | None:
+        return None
+
     def inject(self, observation: Sequence[Block], memory: MemoryTokens | None) -> Injection:
         """All that enters the backbone for one chunk, from its observation blocks and the memory's tokens."""
         return Injection(
             self.blocks(observation, memory), self.visibility, self.hook(memory), self.condition(memory),
-            self.beside(memory),
+            self.beside(memory), self.past(memory),
         )  # fmt: skip
 
 
@@ -99,7 +103,10 @@ def ages_of(memory: MemoryTokens) -> Tensor:
     return memory.ages
 
 
-EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
+EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {
+    "extra_experts": "expert",
+    "past": "cache",
+}
 """Method of an integration → the feature that a backbone must support for it (`Backbone.supports`)."""
 
 

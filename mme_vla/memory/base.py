@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError, require
 from mme_vla.memory.history import FrameScorer, History, LazyHistory, OnlineHistory, StorageSpec
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, Labels, MemoryTokens
 
 POSITION_GRID = 16
 """Rows and columns of token positions are in sixteenths of a view's side, as released, whatever its token grid."""
@@ -53,7 +53,8 @@ class MemoryModule(nn.Module):
         reporting: set from outside for updates that are logged; `forward` then fills `MemoryTokens.metrics`.
 
     Optional capabilities are classes to inherit from as well: `StreamingMemory`, `ScoringMemory`, `ProprioMemory`,
-    `PastViewMemory`, `CompilableMemory`, `MatmulPrecision`.
+    `PastViewMemory`, `CompilableMemory`, `MatmulPrecision`, and `ReadsLabels` (types.py) of a memory whose
+    `MemoryTokens.losses` need labels.
     """
 
     budget: int
@@ -139,6 +140,45 @@ class MemoryModule(nn.Module):
 
 Memory = MemoryModule
 """The former name."""
+
+CacheEntry = tuple[int, Tensor]
+"""The frame of a chunk's observation, and keys and values [layers, 2, n, K, h] of tokens of its prefix."""
+
+NEVER = 1_000_000
+"""Frames between two whose tokens are stored, of memories that read none."""
+
+
+class CacheMemory(MemoryModule):
+    """A memory of keys and values that the backbone made of earlier prefixes (`MemoryTokens.cache`).
+
+    A subclass implements `write`. It has no tokens and reads no stored frames unless it overrides the other methods.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.budget = self.capacity = 0
+        self.storage = StorageSpec(1, "mean", NEVER)
+
+    def write(self, entries: Sequence[CacheEntry], new: CacheEntry) -> Sequence[CacheEntry]:
+        """What is stored after a chunk. It must change nothing in place: a chunk that fails is sampled again.
+
+        Args:
+            entries: what was stored before, oldest first. new: the frame of the chunk's observation, and the keys and
+                values of its prefix.
+        """
+        raise NotImplementedError
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return np.zeros(0, np.int64)
+
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        return HistoryTokens(torch.zeros(0, 1), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), torch.tensor(step))
+
+    def condition_on_prompt(self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        return history
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        return MemoryTokens(history.features, history.mask)
 
 
 class StreamingMemory:
@@ -293,14 +333,17 @@ def stack_history(items: Sequence[HistoryTokens], device: torch.device | None = 
     """Stack unbatched selections into one batch [b, n, …]; shorter ones, of left-padded memories, are padded there."""
     length = max(len(item.mask) for item in items)
 
-    def stack(name: str) -> Tensor:
-        rows = [getattr(item, name) for item in items]
+    def stack(rows: Sequence[Tensor]) -> Tensor:
         around = [0, 0] * (rows[0].ndim - 1)
         return torch.stack([nn.functional.pad(row, (*around, length - len(row), 0)) for row in rows]).to(device)
 
     steps = [item.step for item in items if item.step is not None]
     step = torch.stack(steps).to(device) if len(steps) == len(items) else None
-    return HistoryTokens(stack("features"), stack("positions"), stack("mask"), step)
+    labels = Labels({name: stack([item.labels[name] for item in items]) for name in items[0].labels})
+    features, positions, mask = (
+        stack([getattr(item, name) for item in items]) for name in ("features", "positions", "mask")
+    )
+    return HistoryTokens(features, positions, mask, step, labels)
 
 
 TEMPORAL_BASE, SPATIAL_BASE = 10_000.0, 1_000.0

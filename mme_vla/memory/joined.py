@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
+    CacheMemory,
     CompilableMemory,
     MemoryModule,
     PastViewMemory,
@@ -28,13 +29,15 @@ from mme_vla.memory.base import (
 )
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, Labels, MemoryTokens, ReadsLabels, labels_read
 
 SHARE_UNIT = 16  # shares are multiples of it, so that they hold whole frames of the smaller grids
 
 
 @MEMORIES.register("joined")
-class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, PastViewMemory, CompilableMemory):
+class JoinedMemory(
+    MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, PastViewMemory, CompilableMemory, ReadsLabels
+):
     """Each member selects and encodes as if it were alone, within its share of the budget.
 
     The history keeps what serves all of them: a grid of which all of theirs are pooled when they are read
@@ -57,6 +60,10 @@ class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, 
         built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
         self.members = nn.ModuleList(built)
         names = [section["name"] for section in sections]
+        require(
+            not any(isinstance(member, CacheMemory) for member in built),
+            f"memory.members={brief(names)}: a memory of keys and values (CacheMemory) cannot be joined with others.",
+        )
         # Equal names get a number.
         self.names = [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]
         self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
@@ -65,6 +72,7 @@ class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, 
         self.pad_left = any(member.pad_left for member in built)
         self.timed = all(member.timed for member in built)
         self.uses_proprio = any(uses_proprio(member) for member in built)
+        self.reads_labels = labels_read(*built)
         self.lazy = all(member.lazy for member in built)
         self.past_view_spec = single_past_view_spec(
             {n: past_view_spec(m) for n, m in zip(self.names, built, strict=True)}
@@ -128,7 +136,14 @@ class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, 
         fixed = [self.memories[i].capacity for i in self._order[1:]]
         lengths = [history.mask.shape[1] - sum(fixed), *fixed]
         pieces = zip(*(getattr(history, name).split(lengths, 1) for name in _FIELDS), strict=True)
-        return [(i, HistoryTokens(f, p, m, history.step)) for i, (f, p, m) in zip(self._order, pieces, strict=True)]
+        labels = [Labels() for _ in self._order]
+        for name, values in history.labels.items():
+            for piece, part in zip(labels, values.split(lengths, 1), strict=True):
+                piece[name] = part
+        return [
+            (i, HistoryTokens(f, p, m, history.step, of))
+            for i, (f, p, m), of in zip(self._order, pieces, labels, strict=True)
+        ]
 
     def start_stream(self) -> tuple[Any, ...]:
         return tuple(start_stream(member) for member in self.memories)
@@ -154,15 +169,13 @@ class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, 
         return [CoarserHistory(history, member.storage) for member in self.memories]
 
     def _joined(self, outputs: Sequence[MemoryTokens]) -> MemoryTokens:
-        metrics = {
-            f"{name}/{key}": value
-            for name, tokens in zip(self.names, outputs, strict=True)
-            for key, value in tokens.metrics.items()
-        }
+        pairs = list(zip(self.names, outputs, strict=True))
+        metrics = {f"{name}/{key}": value for name, of in pairs for key, value in of.metrics.items()}
+        losses = {f"{name}/{key}": value for name, of in pairs for key, value in of.losses.items()}
         member_ages = [f.ages for f in outputs if f.ages is not None]
         ages = torch.cat(member_ages, 1) if len(member_ages) == len(outputs) else None
         tokens, mask = torch.cat([f.tokens for f in outputs], 1), torch.cat([f.mask for f in outputs], 1)
-        return MemoryTokens(tokens, mask, metrics, ages)
+        return MemoryTokens(tokens, mask, metrics, ages, losses)
 
 
 _FIELDS = ("features", "positions", "mask")

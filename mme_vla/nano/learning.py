@@ -156,7 +156,8 @@ class Decisions(Dataset[int]):
 
         tensors = load_file(path)
         distant = tensors.pop("far")
-        past = {name.removeprefix(_PAST): value for name, value in tensors.items() if name.startswith(_PAST)}
+        names = [name for name in tensors if name.startswith(_PAST)]
+        past: dict[str, Any] = {name.removeprefix(_PAST): tensors[name] for name in names}
         now: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith(_PAST)}
         batch = Batch(**now, history=HistoryTokens(**past) if past else None)
         return cls(batch, distant, oversample, noise, token_noise)

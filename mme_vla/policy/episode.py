@@ -59,6 +59,10 @@ class Episode:
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
+        self.notes: dict[str, str] = {}
+        """The notes of prompts that read some, by name; a policy that writes notes replaces its own at each `act`."""
+        self.written: list[dict[str, Any]] = []
+        """What the policy wrote: for each decision its frame, and the lines by name."""
         self.options: tuple[Option, ...] = ()
         """The options of policies that choose among some; set them before `act`."""
         memory = policy.memory
@@ -249,7 +253,8 @@ class Episode:
         """The processor's encoding of goal and subgoal."""
         processor, state = self._policy.require_processor(), self._recent[-1][1] if self._recent else None
         goal = self._robot.action.worded(self.goal, self.options)
-        return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
+        notes = {"notes": self.notes} if processor.prompt_spec.notes else {}
+        return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed, **notes)
 
     def set_action_prefix(self, actions: np.ndarray, delay: int = 0) -> None:
         """Make the next chunk, and it alone, continue actions that the robot executes meanwhile (real-time chunking).
@@ -268,9 +273,15 @@ class Episode:
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
         """Note the frames at which sub-tasks began, if the environment reports them; only probes use it."""
 
-    def acted(self, chunk: np.ndarray) -> None:
-        """Note the chunk [h, w] of the policy; the frames that follow tell how much of it was executed."""
+    def acted(self, chunk: np.ndarray, notes: Mapping[str, str] | None = None) -> None:
+        """Take the chunk [h, w] of the policy, and the notes it wrote.
+
+        The frames that follow tell how much of the chunk was executed.
+        """
         self._chunk, self.action_prefix = chunk, None
+        if notes:
+            self.notes |= notes
+            self.written.append({"frame": self.n_observed_frames - 1, **notes})
 
     @property
     def noise_state(self) -> Tensor:

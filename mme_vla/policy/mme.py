@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLanguageHead, HasLoraTargets
 from mme_vla.backbone.building import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.layers import check_backend
@@ -20,6 +20,7 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import (
+    CacheMemory,
     CompilableMemory,
     MatmulPrecision,
     MemoryModule,
@@ -32,6 +33,7 @@ from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.model import MMEModel
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
+from mme_vla.policy.caching import CachingEpisode, stack_caches, stage_writes
 from mme_vla.policy.episode import Episode, prefix_overlap
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.network import MemoryTower, NetworkPolicy
@@ -154,7 +156,8 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             memory: memory tokens; by default those of `batch.history`.
 
         Returns:
-            The loss and its metrics; the memory's own begin with `memory/` and are present while `memory.reporting`.
+            The loss and its metrics. Auxiliary losses are `losses/<name>`, unweighted. The memory's own begin with
+            `memory/` and are present while `memory.reporting`.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
@@ -168,9 +171,13 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         if memory is None:
             with self.autocast():
                 memory = self.encode_memory(self.conditioned_history(batch))
-        loss = self.loss(batch, values, memory, augmentation)
+        losses = self.losses(batch, values, memory, augmentation)
+        loss = self.total_loss(losses)
+        metrics = {"loss": loss.detach()}
+        if len(losses) > 1:
+            metrics |= {f"losses/{name}": value.detach() for name, value in losses.items()}
         reported = {} if memory is None else memory.metrics
-        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
+        return loss, metrics | {f"memory/{name}": value for name, value in reported.items()}
 
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
@@ -237,7 +244,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
     @property
     def compiles_sampling(self) -> bool:
         """Whether the backbone's sampler can be compiled."""
-        return isinstance(self.backbone, CapturableSampling)
+        return isinstance(self.backbone, CapturableSampling) and not isinstance(self.memory, CacheMemory)
 
     def compile_sampling(self, layers: bool = False) -> None:
         """Speed up sampling with fixed weights; chunks are equal up to the rounding of other kernels.
@@ -272,6 +279,10 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
     # Episodes
 
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        kind = CachingEpisode if isinstance(self.memory, CacheMemory) else Episode
+        return kind(self, goal, seed)
+
     def observation(self, episodes: Sequence[Episode]) -> Batch:
         """The current views and prompts of running episodes."""
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
@@ -292,7 +303,15 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         self, batch: Batch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for the batch of `observation`, with the episodes' memories."""
-        return self.sample_actions(batch, noise, steps, memory=self._memory_tokens(episodes, batch))
+        memory = self._memory_tokens(episodes, batch)
+        if not isinstance(self.memory, CacheMemory):
+            return self.sample_actions(batch, noise, steps, memory=memory)
+        assert memory is not None
+        memory.cache = stack_caches(episodes)
+        values = map_noise(noise, lambda value: send(value, self.device))
+        chunk, made = self.sample_and_keep(batch, values, steps, memory)
+        stage_writes(self.memory, episodes, made)
+        return chunk
 
     @torch.no_grad()
     def _memory_tokens(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
@@ -309,6 +328,20 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             for episode, history in zip(episodes, histories, strict=True):
                 episode.read = history
             return encode_histories(self.memory, histories, [e.stream for e in episodes])
+
+    @torch.no_grad()
+    def write_notes(self, batch: Batch, episodes: Sequence[Episode]) -> list[dict[str, str]]:
+        """The lines that a backbone with a language head writes; nothing without one."""
+        if not isinstance(self.backbone, HasLanguageHead):
+            return [{} for _ in episodes]
+        memory, tokenizer = self._memory_tokens(episodes, batch), self.require_processor().tokenizer  # type: ignore[attr-defined]
+        if memory is not None:
+            memory.cache = stack_caches(episodes)
+        with self.autocast():
+            prepared = self.prepare_images(batch)
+            ids = self.backbone.write(prepared, self.inject(prepared, memory)).tolist()
+        lines = (tokenizer.decode([token for token in row if 0 < token < tokenizer.vocab_size]) for row in ids)
+        return [{self.backbone.note: " ".join(line.split())} for line in lines]
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -17,7 +17,7 @@ from mme_vla.memory.base import stack_history
 from mme_vla.processing.images import stack_past
 from mme_vla.processing.normalise import NormStats, normalize
 from mme_vla.registry import PROCESSORS
-from mme_vla.types import Batch
+from mme_vla.types import Batch, Labels
 from mme_vla.utils import check_sums, inside, read_json
 
 CONFIG_FILE = "processor.json"
@@ -33,6 +33,7 @@ class Sample:
     views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
     goal: the task in words; subgoal: its current part, where the policy reads one.
     past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk, absolute.
+    notes: texts of the prompt's notes by name. written: the lines that the policy should write at this step.
     """
 
     views: Mapping[str, np.ndarray]
@@ -41,6 +42,8 @@ class Sample:
     subgoal: str | None
     past_actions: np.ndarray
     actions: np.ndarray
+    notes: Mapping[str, str] = field(default_factory=dict)
+    written: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class PromptSpec:
     encoder: what turns text into numbers, for reports. name: of the prompt format, for messages.
     reads_subgoal: whether the prompt has a subgoal. past_actions: executed actions in it.
     fingerprint: equal for two processors only if text means the same numbers to both; None if that needs no check.
+    notes: names of the notes in it; such a processor's `prompt` takes them as `notes`. writes: those that the policy
+    learns to write.
     """
 
     encoder: str
@@ -80,6 +85,8 @@ class PromptSpec:
     reads_subgoal: bool = False
     past_actions: int = 0
     fingerprint: str | None = None
+    notes: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -187,7 +194,8 @@ class PolicyProcessor:
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
         """Items as the batch that the policy reads: an object with `to`.
 
-        An item may also hold `history` (a memory's selection) and `action_mask` [h], which the dataset adds.
+        An item may also hold `history` (a memory's selection), `action_mask` [h], `weight` [] and `labels` (by name),
+        which the dataset adds.
         """
         raise NotImplementedError
 
@@ -279,6 +287,10 @@ def collate(items: Sequence[dict[str, Any]]) -> Batch:
         action_mask=stack("action_mask") if "action_mask" in items[0] else None,
         state=stack("state"),
         past=stack_past([item.get("past") for item in items]),
+        weight=stack("weight") if "weight" in items[0] else None,
+        labels=Labels(
+            {name: torch.stack([item["labels"][name] for item in items]) for name in items[0].get("labels", ())}
+        ),
     )
     return batch.without_prompt_padding()
 

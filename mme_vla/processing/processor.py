@@ -25,7 +25,7 @@ from mme_vla.processing.base import (
 )
 from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.normalise import NormStats, normalize, unnormalize
-from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
+from mme_vla.processing.prompt import PROMPTS, PromptInput, checked_text, encode_prompt, shorten
 from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch
@@ -169,8 +169,9 @@ class Processor(PolicyProcessor):
     def prompt_spec(self) -> PromptSpec:
         kind, tokenizer = self.prompt_format, self.tokenizer
         return PromptSpec(
-            tokenizer.spec, self.prompt_name, kind.reads_subgoal, kind.past_actions, tokenizer.fingerprint
-        )
+            tokenizer.spec, self.prompt_name, kind.reads_subgoal, kind.past_actions, tokenizer.fingerprint,
+            tuple(kind.notes), tuple(kind.writes),
+        )  # fmt: skip
 
     @property
     def longest_prompt(self) -> int:
@@ -206,6 +207,7 @@ class Processor(PolicyProcessor):
         subgoal: str | None = None,
         state: np.ndarray | Tensor | None = None,
         past_actions: np.ndarray | Tensor | None = None,
+        notes: Mapping[str, str] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Tokenise the prompt.
 
@@ -215,6 +217,7 @@ class Processor(PolicyProcessor):
             state: [s] raw state; formats that do not use it ignore it.
             past_actions: [n, w] absolute actions executed so far, oldest first; formats that do not use them ignore
                 them, the others read the last ones, relative to `state`.
+            notes: texts by name; those that the format reads and are not there are empty.
 
         Returns:
             ids [l] int64 and mask [l] bool.
@@ -228,7 +231,10 @@ class Processor(PolicyProcessor):
             past = normalize(recent, self.require_stats().actions).numpy()
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
-        inputs = PromptInput(goal, subgoal, normalised, past)
+        texts = {
+            name: checked_text((notes or {}).get(name, ""), f"the note {name!r}") for name in self.prompt_format.notes
+        }
+        inputs = PromptInput(goal, subgoal, normalised, past, texts)
         return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
@@ -270,7 +276,7 @@ class Processor(PolicyProcessor):
         """Images [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
         state = sample.states[-1]
         prompt, prompt_mask = self.prompt(
-            sample.goal, subgoal=sample.subgoal, state=state, past_actions=sample.past_actions
+            sample.goal, sample.subgoal, state=state, past_actions=sample.past_actions, notes=sample.notes
         )
         return {
             "images": self.images([frames[-1] for frames in sample.views.values()]),
@@ -278,7 +284,18 @@ class Processor(PolicyProcessor):
             "prompt_mask": prompt_mask,
             "state": torch.from_numpy(state),
             "actions": self.actions(sample.actions, state),
+            **(
+                {"labels": {name: self.line_ids(text) for name, text in sample.written.items()}}
+                if sample.written
+                else {}
+            ),
         }
+
+    def line_ids(self, text: str) -> Tensor:
+        """Token ids [note_length] int64 of a line to write, 0 after its end."""
+        length = self.prompt_format.note_length
+        ids = self.tokenizer.encode(text, bos=False)[:length]
+        return torch.tensor(ids + [0] * (length - len(ids)))
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Batch:
         """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""

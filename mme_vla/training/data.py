@@ -14,10 +14,11 @@ from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import TrainsOnKeyframes, with_vision_memory
+from mme_vla.policy.capabilities import TrainsOnKeyframes, WeighsLosses, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
+from mme_vla.types import labels_read
 from mme_vla.utils import check_sums, inside
 
 
@@ -63,6 +64,11 @@ def prepare_data(
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video,
         )  # fmt: skip
+    labels = labels_read(*(part for part in policy.children() if part is not policy.memory))
+    require(
+        data.get("weights") is None or (isinstance(policy, WeighsLosses) and processor.samples.kind == "steps"),
+        f"data.weights={data.get('weights')}: {type(policy).__name__} does not weigh samples. Set data.weights=null.",
+    )
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
@@ -96,7 +102,8 @@ def prepare_data(
         kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
         return kind(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
-            mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal, seed=seed,
+            mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal,
+            labels=labels, weights=data.get("weights"), texts=data.get("texts"), seed=seed,
             transforms=() if held_out else transforms,
         )  # fmt: skip
 

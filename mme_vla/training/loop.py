@@ -16,7 +16,7 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import AugmentsImages
+from mme_vla.policy.capabilities import AugmentsImages, WeighsLosses
 from mme_vla.speed import Recomputes
 from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, save_shards, tidy, trainable
 from mme_vla.training.data import SplitData
@@ -92,6 +92,10 @@ class Trainer:
         if not self.sharded:
             policy.to(accelerator.device)
         self.policy = policy.train()
+        if settings.losses:
+            if not isinstance(policy, WeighsLosses):
+                raise UserError(f"train.losses: {type(policy).__name__} has no auxiliary losses. Leave it out.")
+            policy.loss_weights = dict(settings.losses)
         if settings.recomputation:
             if not isinstance(policy, Recomputes):
                 raise UserError(

@@ -55,6 +55,7 @@ class TrainSettings:
     save_every: PositiveInt = 1000
     keep: KeepRule = field(default_factory=KeepRule)
     open_loop_chunks: NonNegativeInt = 32
+    losses: Mapping[str, Any] | None = None
     seed: int = 42
 
     @classmethod
@@ -74,6 +75,9 @@ class TrainSettings:
             "betas": (all(0 <= beta < 1 for beta in self.betas), "two numbers in [0, 1)"),
             "batch_size": (not self.batch_size % self.accumulate, f"a multiple of train.accumulate={self.accumulate}"),
         }  # fmt: skip
+        for name, weight in (self.losses or {}).items():
+            number = isinstance(weight, int | float) and not isinstance(weight, bool) and 0 <= weight < float("inf")
+            require(number, f"train.losses.{name}={weight!r} must be a number of 0 or more, the weight of this loss.")
         for name, (fits, expected) in checks.items():
             require(fits, f"train.{name}={getattr(self, name)!r} must be {expected}.")
 

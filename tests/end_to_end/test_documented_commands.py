@@ -30,6 +30,7 @@ pytestmark = pytest.mark.slow
 EXAMPLES = {
     "add-a-memory.md": "last_frames", "add-a-backbone.md": "regression", "add-an-integration.md": "gist",
     "add-a-task.md": "two_buttons", "your-robot.md": "bimanual", "first-hour.md": "first_hour",
+    "auxiliary-losses.md": "write_head", "cached-keys-and-values.md": "fifo", "notes.md": "scratchpad",
 }  # fmt: skip
 """The folder that the commands of a page are typed in; of other pages it is the repository's root."""
 NOT_RUN = {

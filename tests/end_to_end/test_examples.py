@@ -48,6 +48,22 @@ ROWS = [
         arms="[hesitate:8]",
         page="history-transforms",
     ),
+    Row(
+        "write_head",
+        "write_head_modul",
+        ("train.losses={write: 0.1}", "memory.budget=64"),
+        logged="train/losses/write",
+        page="auxiliary-losses",
+    ),
+    Row("fifo", "fifo", arms="[drop:1]", page="cached-keys-and-values"),
+    Row(
+        "scratchpad",
+        "scratchpad",
+        ("data.texts={scratchpad: simple_subgoal}",),
+        logged="train/losses/line",
+        arms="[]",
+        page="notes",
+    ),
 ]
 PARAMETERS = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 

@@ -269,6 +269,7 @@ class Rollout:
                 **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
                 **({PROCESS: running.process} if running.process else {}),
+                **({"notes": running.episode.written} if running.episode.written else {}),
                 **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },
         )  # fmt: skip

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, check_sizes
-from mme_vla.memory.base import ProprioMemory
+from mme_vla.memory.base import NEVER, ProprioMemory
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
@@ -34,9 +34,6 @@ from mme_vla.memory.recurrent import (
 )
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
-
-NEVER = 1_000_000
-"""Frames between two whose images are kept: the first alone."""
 
 
 class MotionRows(History):

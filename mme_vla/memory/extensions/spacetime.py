@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, check_sizes, require
-from mme_vla.memory.base import MemoryModule, PastViewMemory, PastViewSpec, ProprioMemory, union_frames
-from mme_vla.memory.extensions.actions import NEVER, MotionRows
+from mme_vla.memory.base import NEVER, MemoryModule, PastViewMemory, PastViewSpec, ProprioMemory, union_frames
+from mme_vla.memory.extensions.actions import MotionRows
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens

@@ -1,0 +1,96 @@
+"""Further columns of a dataset: labels and weights of samples (numbers), and notes of a prompt (texts)."""
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.lerobot_files import parquet_files
+from mme_vla.errors import UserError, check_known, listed, require
+
+BOUNDARY = "subtask_boundary"
+"""The label that is 1 at the first frame of every sub-task and 0 elsewhere, from the column `simple_subgoal`."""
+
+
+def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
+    """A label of every frame of a dataset, [rows] or [rows, k] float32: a column of numbers, or `subtask_boundary`.
+
+    Args:
+        key: what names the column, for messages (`data.weights`).
+
+    Raises:
+        UserError: no such column, or a value that is missing, not finite or of another size; it names the episode.
+    """
+    if name == BOUNDARY:
+        return _boundaries(source)
+    column = _read(source, name, key)
+    values = column.combine_chunks()
+    nested = pa.types.is_list(values.type) or pa.types.is_large_list(values.type)
+    if pa.types.is_fixed_size_list(values.type):
+        values, nested = values.cast(pa.list_(values.type.value_type)), True
+    kind = values.type.value_type if nested else values.type
+    require(
+        pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind),
+        f"{key}: the column {name!r} of {source.name} holds {kind}: a label needs numbers.",
+    )
+    _check(source, name, key, values.is_null().to_numpy(zero_copy_only=False), "has no value")
+    if nested:
+        sizes = pc.list_value_length(values).to_numpy(zero_copy_only=False)
+        width = int(np.bincount(sizes).argmax())
+        _check(source, name, key, sizes != width, f"does not hold {width} numbers")
+        flat = values.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)
+        numbers = flat.astype(np.float32).reshape(-1, width)
+    else:
+        numbers = values.cast(pa.float64()).to_numpy(zero_copy_only=False).astype(np.float32)
+    wrong = ~np.isfinite(numbers)
+    _check(source, name, key, wrong.any(1) if nested else wrong, "is missing or not finite")
+    return numbers
+
+
+def weight_column(source: EpisodeSource, name: str) -> np.ndarray:
+    """The weight of every frame of a dataset, [rows] float32, 0 or more (`data.weights`)."""
+    weights = label_column(source, name, "data.weights")
+    require(weights.ndim == 1, f"data.weights: the column {name!r} of {source.name} needs one number a frame.")
+    _check(source, name, "data.weights", weights < 0, "is negative")
+    return weights
+
+
+def text_column(source: EpisodeSource, name: str) -> pa.ChunkedArray:
+    """The text of every frame of a dataset (`data.texts`)."""
+    column = _read(source, name, "data.texts")
+    require(
+        pa.types.is_string(column.type) or pa.types.is_large_string(column.type),
+        f"data.texts: the column {name!r} of {source.name} holds {column.type}, no texts.",
+    )
+    _check(source, name, "data.texts", column.is_null().to_numpy(zero_copy_only=False), "has no value")
+    return column
+
+
+def _read(source: EpisodeSource, name: str, key: str) -> Any:
+    files = parquet_files(source.root, "data")
+    schemas = [set(pq.read_schema(file).names) for file in files]
+    check_known(f"column of {source.name} ({key})", name, set.intersection(*schemas))
+    return pa.concat_tables([pq.read_table(file, columns=[name]) for file in files])[name]
+
+
+def _boundaries(source: EpisodeSource) -> np.ndarray:
+    codes = text_column(source, "simple_subgoal").combine_chunks().dictionary_encode().indices.to_numpy()
+    begins = np.concatenate([[True], np.diff(codes) != 0])
+    begins[np.cumsum(source.lengths) - source.lengths] = True
+    return begins.astype(np.float32)
+
+
+def _check(source: EpisodeSource, name: str, key: str, wrong: np.ndarray, problem: str) -> None:
+    """Raise an error that names the first frame, and the episodes, of rows that are wrong, [rows] bool."""
+    rows = np.flatnonzero(wrong)
+    if not len(rows):
+        return
+    episode, frame = source.locate(int(rows[0]))
+    episodes = np.unique(np.searchsorted(np.cumsum(source.lengths), rows, side="right")).tolist()
+    raise UserError(
+        f"{key}: the column {name!r} of {source.name} {problem} at frame {frame} of episode {episode} (in all: "
+        f"{'episodes' if len(episodes) > 1 else 'episode'} {listed(episodes)}). Correct the column."
+    )

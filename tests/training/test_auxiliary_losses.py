@@ -1,0 +1,179 @@
+"""Auxiliary losses, their labels from dataset columns, and sample weights."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from helpers import REPOSITORY
+from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.backbone.base import AuxiliaryLosses, Injection
+from mme_vla.data.columns import BOUNDARY, label_column
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.memory.base import stack_history
+from mme_vla.testing.small import open_gates, random_batch, small_policy, unit_stats
+from mme_vla.training.settings import TrainSettings
+from mme_vla.types import Batch, Labels, MemoryTokens
+
+EXAMPLE = REPOSITORY / "examples" / "write_head"
+TABLE = "data/chunk-000/file-000.parquet"
+
+
+@pytest.fixture
+def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    policy = build_policy("write_head_modul", config_dir=EXAMPLE / "configs", memory={"budget": 64})
+    assert isinstance(policy, MMEPolicy)
+    policy.require_processor().stats = unit_stats()
+    open_gates(policy)
+    return policy.train()
+
+
+def labelled(policy: MMEPolicy) -> Batch:
+    batch = random_batch(policy, batch=2, valid=32)
+    assert batch.history is not None
+    labels = Labels({BOUNDARY: (batch.history.positions[..., 0] % 2).float() * batch.history.mask})
+    return replace(batch, history=replace(batch.history, labels=labels))
+
+
+def loss_of(policy: MMEPolicy, batch: Batch, **weights: float) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    policy.loss_weights = weights
+    policy.zero_grad()
+    noise = policy.training_noise(2, torch.Generator().manual_seed(3))
+    loss, metrics = policy(batch, noise | {"changes": policy._sample_augmentation(2, torch.Generator().manual_seed(4))})
+    loss.backward()
+    return loss.detach(), metrics
+
+
+def gradients(policy: MMEPolicy) -> dict[str, torch.Tensor]:
+    return {name: p.grad.clone() for name, p in policy.named_parameters() if p.grad is not None}
+
+
+def test_the_auxiliary_loss_is_weighed_and_logged(policy: MMEPolicy) -> None:
+    batch = labelled(policy)
+    loss, metrics = loss_of(policy, batch, write=0.5)
+    assert torch.equal(loss, metrics["losses/action"] + 0.5 * metrics["losses/write"])
+    assert metrics["losses/write"] > 0
+    assert policy.memory.write.weight.grad.abs().sum() > 0
+    assert loss_of(policy, batch)[0] == metrics["losses/action"] + metrics["losses/write"]
+
+
+def test_weight_zero_leaves_loss_and_gradients_bitwise_equal(policy: MMEPolicy) -> None:
+    batch = labelled(policy)
+    loss, _ = loss_of(policy, batch, write=0.0)
+    weighed = gradients(policy)
+    plain, metrics = loss_of(policy, replace(batch, history=replace(batch.history, labels=Labels())))
+    assert torch.equal(loss, plain)
+    assert "losses/write" not in metrics
+    assert all(torch.equal(weighed[name], value) for name, value in gradients(policy).items())
+
+
+def test_evaluation_has_no_auxiliary_loss(policy: MMEPolicy) -> None:
+    noise = policy.training_noise(2, torch.Generator().manual_seed(3))
+    policy.eval()
+    loss, metrics = policy(labelled(policy), noise)
+    assert set(metrics) == {"loss"}
+    assert torch.equal(
+        loss, policy(replace(labelled(policy), history=random_batch(policy, valid=32).history), noise)[0]
+    )
+
+
+def test_an_unknown_name_in_the_weights_is_an_error(policy: MMEPolicy) -> None:
+    with pytest.raises(UserError, match="Did you mean 'write'"):
+        loss_of(policy, labelled(policy), writes=1.0)
+    with pytest.raises(UserError, match=r"train.losses.write=-1 must be a number of 0 or more"):
+        TrainSettings(1, 1, 1.0, losses={"write": -1})
+
+
+def test_weights_multiply_a_samples_loss_after_its_mean() -> None:
+    policy = small_policy("framesamp_modul").train()
+    batch = random_batch(policy, batch=2, valid=32)
+    both = loss_of(policy, replace(batch, weight=torch.ones(2)))[0]
+    first = loss_of(policy, replace(batch, weight=torch.tensor([2.0, 0.0])))[0]
+    second = loss_of(policy, replace(batch, weight=torch.tensor([0.0, 2.0])))[0]
+    torch.testing.assert_close(both, loss_of(policy, batch)[0])
+    torch.testing.assert_close((first + second) / 2, both)
+    assert first != second
+
+
+def test_integration_and_backbone_may_return_losses() -> None:
+    class Sums(type(small_policy("framesamp_modul").integration), AuxiliaryLosses):  # type: ignore[misc]
+        reads_labels = ("speed",)
+
+        def losses(self, batch: Batch, injection: Injection, memory: MemoryTokens | None) -> dict[str, torch.Tensor]:
+            return {"speed": batch.labels["speed"] * memory.tokens.square().mean((1, 2))}
+
+    policy = small_policy("framesamp_modul").train()
+    policy.integration.__class__ = Sums
+    batch = replace(random_batch(policy, valid=32), labels=Labels(speed=torch.tensor([1.0, 2.0])))
+    assert loss_of(policy, batch)[1]["losses/speed"] > 0
+
+
+def test_labels_lie_at_the_frames_of_the_tokens(policy: MMEPolicy, tmp_path: Path) -> None:
+    from mme_vla.training.data import prepare_data
+
+    data = {
+        "name": "sample", "sources": ["sample"], "val_fraction": 0.0, "val_episodes": [], "action_offset": 0,
+        "mask_padding": False, "jitter": False, "weights": "frame_index",
+        "cache": {"root": str(tmp_path), "batch_size": 32, "max_build_frames": 5000},
+    }  # fmt: skip
+    dataset = prepare_data(policy, data, 0, say=lambda line: None).train
+    item = dataset[150]
+    source, episode, frame = item["place"]
+    texts = [dataset.sources[source].subgoals(episode, i)["simple_subgoal"] for i in range(frame + 1)]
+    begins = [float(i == 0 or texts[i] != texts[i - 1]) for i in range(frame + 1)]
+    history = item["history"]
+    frames = history.positions[:, 0].long().tolist()
+    expected = [begins[f] if valid else 0.0 for f, valid in zip(frames, history.mask.tolist(), strict=True)]
+    assert history.labels[BOUNDARY].tolist() == expected
+    assert item["weight"] == frame
+    batch = policy.require_processor().collate([item, dataset[10]])
+    assert batch.history.labels[BOUNDARY].shape == batch.history.mask.shape
+    assert batch.weight.tolist() == [frame, dataset[10]["weight"]]
+    assert stack_history([history]).rows(slice(0, 1)).labels[BOUNDARY].shape == (1, 64)
+
+
+def test_joined_memories_read_labels_and_return_losses(policy: MMEPolicy) -> None:
+    joined = build_policy(
+        "pi05", memory=[{"name": "write_head", "budget": 32}, {"name": "framesamp", "budget": 32}],
+        integration="modulator", config_dir=EXAMPLE / "configs",
+    )  # fmt: skip
+    assert isinstance(joined, MMEPolicy)
+    joined.require_processor().stats = unit_stats()
+    assert joined.memory.reads_labels == (BOUNDARY,)
+    assert "losses/write_head/write" in loss_of(joined.train(), labelled(joined))[1]
+
+
+CASES: list[tuple[str, Callable[[np.ndarray], pa.Array], str]] = [
+    ("missing", lambda v: pa.array([None if i == 400 else x for i, x in enumerate(v.tolist())]), "has no value"),
+    ("infinite", lambda v: pa.array(np.where(np.arange(len(v)) == 400, np.inf, v)), "is missing or not finite"),
+    ("ragged", lambda v: pa.array([[x] * (3 if i == 400 else 2) for i, x in enumerate(v)]), "does not hold 2 numbers"),
+]
+
+
+@pytest.mark.parametrize(("name", "change", "problem"), CASES, ids=[case[0] for case in CASES])
+def test_a_bad_label_names_column_and_episode(name: str, change: Any, problem: str, tmp_path: Path) -> None:
+    root = tmp_path / "sample"
+    shutil.copytree(SAMPLE, root)
+    (root / "SHA256SUMS").unlink(missing_ok=True)
+    table = pq.read_table(root / TABLE)
+    pq.write_table(table.append_column("reward", change(np.arange(len(table), dtype=np.float64))), root / TABLE)
+    source = EpisodeSource(root)
+    episode, frame = source.locate(400)
+    with pytest.raises(UserError, match=rf"'reward' of sample {problem} at frame {frame} of episode {episode} "):
+        label_column(source, "reward", "data.weights")
+
+
+def test_an_absent_column_is_reported() -> None:
+    with pytest.raises(
+        UserError, match=r"Unknown column of sample \(data.weights\) 'step_id'. Did you mean 'step_idx'"
+    ):
+        label_column(EpisodeSource("sample"), "step_id", "data.weights")
