@@ -137,6 +137,7 @@ SUBGOALS: Registry[Any] = Registry(
     },
 )
 TASKS: Registry[Any] = Registry("task")
+ENVS: Registry[Any] = Registry("environment", dict.fromkeys(("mme_vla", "official"), "mme_vla.envs.benchmark"))
 PLAYERS: Registry[Any] = Registry(
     "player",
     {
@@ -147,7 +148,7 @@ PLAYERS: Registry[Any] = Registry(
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
-    "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
+    "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "env": ENVS, "player": PLAYERS,
     "intervention": INTERVENTIONS,
 }  # fmt: skip
 
@@ -157,7 +158,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
+            `subgoal` (a predictor), `task`, `env`, `player` or `intervention` (of a probe).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

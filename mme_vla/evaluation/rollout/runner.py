@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mme_vla.envs import metadata
+from mme_vla.envs.base import environment
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord
@@ -241,7 +241,8 @@ class Rollout:
         outcome = status if status in ("success", "fail", "timeout") else "error"
         if outcome == "error":
             error = error or f"the environment ended the episode with the status {status!r}"
-        spec = metadata.episode(job.task, job.split, job.episode)
+        source = environment(self.settings.env)
+        spec, suite = source.episode(job.task, job.split, job.episode), source.suite_of(job.task)
         robot = self.policy.embodiment
         record = EpisodeRecord(
             **vars(self.facts), action_space=robot.action.answers or robot.name, task=job.task, episode=job.episode,
@@ -250,6 +251,7 @@ class Rollout:
             extra={
                 "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
                 "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
+                **({"suite": suite} if suite else {}),
                 **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
                 **({PROCESS: running.process} if running.process else {}),
