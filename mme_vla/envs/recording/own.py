@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.console import progress
+from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.envs.base import Environment, EpisodeEnv
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError, require
@@ -31,7 +31,7 @@ def record_own(
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
     failures, frames = [], 0
-    with progress("record", len(specs), unit="episodes") as advance:
+    with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
         for spec in specs:
             rows, success = _demonstrated(environment, spec, max_steps)
             if not success:
