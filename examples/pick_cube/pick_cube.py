@@ -1,5 +1,7 @@
 """ManiSkill's own PickCube-v1 as an environment: its scene, its success, and a demonstrator that moves the hand."""
 
+from functools import cache
+
 import gymnasium
 import mani_skill.envs  # noqa: F401
 import numpy as np
@@ -30,6 +32,9 @@ class PickCube(gymnasium.Wrapper):
             image = observation["sensor_data"]["base_camera"]["rgb"][0].cpu().numpy()
         return {"base": image, "state": np.concatenate([finger, cube - hand, goal - cube]).astype(np.float32)}
 
+    def close(self):
+        """Keep the scene: a new one compiles its shaders anew."""
+
     def reset(self, *, seed=None, options=None):
         observation, _ = self.env.reset(seed=seed, options=options)
         return self.observe(observation), {"goal": "pick up the cube and bring it to the green point"}
@@ -41,6 +46,9 @@ class PickCube(gymnasium.Wrapper):
         return self.observe(observation), float(reward), success, bool(truncated), {"success": success}
 
 
+scene = cache(PickCube)
+
+
 @register("env", "pick_cube")
 class PickCubeEnvironment(Environment):
     tasks = ("PickCube-v1",)
@@ -48,11 +56,11 @@ class PickCubeEnvironment(Environment):
                       action={"width": 4, "horizon": 4, "execute": 4})  # fmt: skip
 
     def make(self, spec, render=True):
-        return PickCube(render)
+        return scene(render)
 
     def demonstrate(self, env):
         """Above the cube, down, close, to the goal."""
-        stages = ((lambda: env.cube + [0, 0, 0.06], 1), (lambda: env.cube, 1), (None, -1), (lambda: env.goal, -1))
+        stages = ((lambda: env.cube + np.array([0, 0, 0.06]), 1), (lambda: env.cube, 1), (None, -1), (lambda: env.goal, -1))
         for target, gripper in stages:
             for _ in range(8 if target is None else 30):
                 offset = np.zeros(3) if target is None else target() - (env.cube if gripper < 0 else env.hand)

@@ -153,4 +153,3 @@ def print_summary(run: PlayRun) -> None:
     console = Console(width=None if sys.stdout.isatty() else 160)
     console.print(table)
     console.print(f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True)
-

@@ -52,7 +52,9 @@ class Environment(ABC):
         Raises:
             UserError: the environment has no demonstrator.
         """
-        require(False, f"{type(self).__name__} has no demonstrator: implement demonstrate(env), a generator of actions.")
+        require(
+            False, f"{type(self).__name__} has no demonstrator: implement demonstrate(env), a generator of actions."
+        )
         yield from ()
 
     def choices(self, env: Any) -> Mapping[str, Actions]:
@@ -76,7 +78,7 @@ class Environment(ABC):
         """Make sure that a split exists."""
         check_known("split", split, self.splits)
 
-    def check_installed(self) -> None:
+    def check_installed(self) -> None:  # noqa: B027
         """Make sure that packages which the environment needs are installed."""
 
     def check_embodiment(self, robot: Embodiment) -> None:

@@ -12,7 +12,7 @@ from mme_vla.registry import ENVS
 
 @ENVS.register("mme_vla")
 class RoboMME(Environment):
-    """The sixteen tasks on stock ManiSkill, and tasks of the user's own; `mme-vla record` demonstrates them with their sub-tasks."""
+    """The sixteen tasks on stock ManiSkill, and tasks of the user's own; `mme-vla record` demonstrates them."""
 
     name: ClassVar[str] = "mme_vla"
     tasks = TASK_NAMES

@@ -16,8 +16,8 @@ def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
     """Names of tasks in the order they are named, each once.
 
     Args:
-        tasks: `all` of the environment, a name, several in one text (`StopCube,BinFill`), or a list of names. The user's
-            tasks need the plugin that registers them.
+        tasks: `all` of the environment, a name, several in one text (`StopCube,BinFill`), or a list of names. Tasks
+            of the user's own need the plugin that registers them.
         env: the environment.
     """
     names = tasks.split(",") if isinstance(tasks, str) else list(tasks)

@@ -30,6 +30,7 @@ pytestmark = pytest.mark.slow
 EXAMPLES = {
     "add-a-memory.md": "last_frames", "add-a-backbone.md": "regression", "add-an-integration.md": "gist",
     "add-a-task.md": "two_buttons", "your-robot.md": "bimanual",
+    "environments.md": "blink",
 }  # fmt: skip
 """The folder that the commands of a page are typed in; of other pages it is the repository's root."""
 NOT_RUN = {

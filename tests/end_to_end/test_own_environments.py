@@ -29,9 +29,10 @@ def run(folder: Path, example: str, command: str, *words: str) -> str:
     return done.stdout
 
 
-def test_the_example_stays_short() -> None:
+def test_the_example_stays_short_and_is_the_one_on_the_page() -> None:
     text = (REPOSITORY / "examples" / "blink" / "blink.py").read_text()
     assert len(text.splitlines()) <= 45 and "._" not in text
+    assert text.strip() in (REPOSITORY / "docs" / "extend" / "environments.md").read_text()
 
 
 @pytest.mark.slow
@@ -65,9 +66,7 @@ def test_an_environment_of_ones_own_works_in_every_command(tmp_path: Path, capsy
 
 
 @pytest.mark.slow
-def test_a_policy_of_an_environment_of_ones_own_is_served(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_policy_of_an_environment_of_ones_own_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("websockets", reason="the server's packages are not installed: the extra `serve` has them")
     monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
     import_plugins(["blink"])

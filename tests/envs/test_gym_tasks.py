@@ -1,5 +1,6 @@
 """The tasks as plain Gymnasium environments: Gymnasium's own check, and PPO of stable-baselines3."""
 
+import re
 import tomllib
 
 import numpy as np
@@ -53,6 +54,13 @@ def test_images_and_the_conditioning_video_are_numpy_arrays() -> None:
         assert info["video"][0].std() > 5, "nothing is rendered"
     finally:
         env.close()
+
+
+def test_the_code_of_the_page_runs() -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs/extend/gymnasium.md").read_text(), re.DOTALL)
+    names: dict[str, object] = {}
+    exec(compile(block, "docs/extend/gymnasium.md", "exec"), names)
+    assert names["info"]["status"] == "ongoing"  # type: ignore[index]
 
 
 def test_the_package_declares_gymnasiums_entry_point() -> None:

@@ -94,7 +94,9 @@ def heat_map(results: Results) -> str:
         suites = results.protocol.suites
         for suite in suites:
             boundary += len(results.protocol.choose("suite", suite))
-            if 0 < boundary < len(tasks) and list(tasks) == [task for s in suites for task in results.protocol.choose("suite", s)]:
+            if 0 < boundary < len(tasks) and list(tasks) == [
+                task for s in suites for task in results.protocol.choose("suite", s)
+            ]:
                 axes.axvline(boundary - 0.5, color="white", lw=3)
         return svg(canvas)
 

@@ -117,7 +117,9 @@ class Protocol:
     @property
     def suites(self) -> list[str]:
         """The suites that take part: RoboMME's, those of other environments, `OWN` last."""
-        return [suite for suite in (*SUITES, *dict.fromkeys(self.own_suites.values()), OWN) if self.choose("suite", suite)]
+        return [
+            suite for suite in (*SUITES, *dict.fromkeys(self.own_suites.values()), OWN) if self.choose("suite", suite)
+        ]
 
     def facts(self, task: str) -> Task:
         """What is known of a task; of an environment's own it is the suite."""
