@@ -18,8 +18,8 @@ GROUPS = {
     "A policy": ["build_policy", "MMEPolicy", "Policy", "Episode", "load_weights"],
     "Evaluation": ["evaluate", "probe", "make_env", "make_vec_env"],
     "Parts to subclass": [
-        "Memory", "PerceptualMemory", "RecurrentMemory", "Integration", "Backbone", "Task", "Environment", "SubgoalPredictor",
-        "register",
+        "Memory", "PerceptualMemory", "RecurrentMemory", "Integration", "Backbone", "Task", "Environment",
+        "SubgoalPredictor", "register",
     ],
     "What parts are given": [
         "Batch", "HistoryTokens", "MemoryTokens", "History", "OnlineHistory", "CachedHistory", "StorageSpec",

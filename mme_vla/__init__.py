@@ -61,8 +61,9 @@ _HOME = {name: f"mme_vla.{module}" for module, names in _MODULES.items() for nam
 __all__ = [
     "BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "Backbone", "Batch", "CachedHistory", "Embodiment",
     "Environment", "Episode", "History", "HistoryTokens", "Integration", "MMEPolicy", "Memory", "MemoryTokens",
-    "OnlineHistory", "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor", "Task", "UserError",
-    "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe", "register",
+    "OnlineHistory", "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor", "Task",
+    "UserError", "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe",
+    "register",
 ]  # fmt: skip
 
 

@@ -60,7 +60,8 @@ class PickCubeEnvironment(Environment):
 
     def demonstrate(self, env):
         """Above the cube, down, close, to the goal."""
-        stages = ((lambda: env.cube + np.array([0, 0, 0.06]), 1), (lambda: env.cube, 1), (None, -1), (lambda: env.goal, -1))
+        above = np.array([0, 0, 0.06])
+        stages = ((lambda: env.cube + above, 1), (lambda: env.cube, 1), (None, -1), (lambda: env.goal, -1))
         for target, gripper in stages:
             for _ in range(8 if target is None else 30):
                 offset = np.zeros(3) if target is None else target() - (env.cube if gripper < 0 else env.hand)
