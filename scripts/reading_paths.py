@@ -1,4 +1,4 @@
-"""Files and lines that a reader needs for five questions about the library (docs/architecture.md).
+"""Files and lines that a reader needs for five questions about the library (docs/extend/architecture.md).
 
 (a) and (e) follow imports from a starting point; (b) to (d) list the files on the way. Every file is checked to exist,
 and every call of (d) to be defined where it is listed.
@@ -85,7 +85,7 @@ def block(page: str) -> str:
 def example() -> tuple[int, int]:
     """Lines of the README's example of the model alone, and the modules of the library that the full one imports."""
     count = "\nimport sys\nprint(len([name for name in sys.modules if name.split('.')[0] == 'mme_vla']))"
-    command = [sys.executable, "-c", block("docs/python.md") + count]
+    command = [sys.executable, "-c", block("docs/start/python.md") + count]
     result = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     return len([line for line in block(ALONE).splitlines() if line.strip()]), int(result.stdout.split()[-1])
 

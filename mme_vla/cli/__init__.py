@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
     "sample": ("sample", "the dataset that the package ships, from a full one"),
     "train-tokenizer": ("train_tokenizer", "the small tokenizer of the package"),
+    "docs": ("docs", "this documentation as a site, built and opened without a network"),
 }
 """Name on the command line → module of this package, and a line of help."""
 

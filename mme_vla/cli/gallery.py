@@ -83,7 +83,7 @@ def run(cfg: "DictConfig") -> None:
     entries = []
     with progress("show", len(specs), unit="tasks") as advance:
         for spec in specs:
-            env, snapshots = _demonstrated(spec)
+            env, snapshots = demonstrated(spec)
             several = sum(other.task == spec.task for other in specs) > 1
             image_name = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
             strip(snapshots, cfg.tiles).save(folder / image_name, quality=82)
@@ -94,7 +94,7 @@ def run(cfg: "DictConfig") -> None:
     print(f"{folder / 'README.md'}: {len(entries)} tasks.")
 
 
-def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
+def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
     """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
     from mme_vla.envs.scene.placement import SceneError
 

@@ -93,7 +93,7 @@ def heading(file: Path) -> tuple[list[str], str]:
             break
         if not line.startswith(_PACKAGE):
             lines.append(line.lstrip("# "))
-    examples = [line for line in lines if line.startswith("python -m ")]
+    examples = [line for line in lines if line.startswith(("python -m ", "mme-vla "))]
     return examples, " ".join(line for line in lines if line not in examples)
 
 

@@ -7,9 +7,9 @@ characters, and text taken as it stands (no prefix, no case folding, spaces and 
 deterministic.
 """
 
+import argparse
 import io
 import string
-import sys
 from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -56,8 +56,12 @@ def read_corpus() -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train on the shipped corpus and write `tokenizer.model` into the folder named first, or the current one."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    path = Path(arguments[0] if arguments else ".") / "tokenizer.model"
+    """Train on the shipped corpus and write `tokenizer.model` into a folder."""
+    parser = argparse.ArgumentParser(prog="mme-vla train-tokenizer", description=str(__doc__).partition("\n")[0])
+    parser.add_argument(
+        "folder", nargs="?", type=Path, default=Path(), help="where to write tokenizer.model (default: here)"
+    )
+    path = parser.parse_args(arguments).folder / "tokenizer.model"
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(train_tokenizer(read_corpus()))
     print(f"Wrote {path} ({VOCAB_SIZE} pieces).")

@@ -33,14 +33,28 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
         + (" with a memory of the episode." if config.get("memory") else " without memory."), "",
         *_table(rows), "",
         "## Use", "",
-        "```python", "from mme_vla import Policy", "",
-        'policy = Policy.from_pretrained("<this repository or folder>")',
-        'episode = policy.start_episode("the goal in words")',
-        "```", "",
+        "```python", *example(config), "```", "",
         "## Data", "", str(known.get("data") or "Not recorded."), "",
         "## Recipe", "", *(_table(known["recipe"]) if known.get("recipe") else ["Not recorded."]), "",
         "## Results", "", *(_table(known["results"]) if known.get("results") else ["Not recorded."]), "",
     ])  # fmt: skip
+
+
+def example(config: Mapping[str, Any]) -> list[str]:
+    """Lines of Python from the weights to an action, with grey frames for the user's own."""
+    robot = config.get("embodiment") or {}
+    views = ", ".join(f'"{camera}": frame' for camera in robot.get("cameras") or ("front", "wrist"))
+    width = (robot.get("state") or {}).get("width", 8)
+    return [
+        "import numpy as np",
+        "from mme_vla import Policy",
+        "",
+        'policy = Policy.from_pretrained("<this repository or folder>")',
+        'episode = policy.start_episode("the goal in words", seed=7)',
+        "frame = np.full((1, 256, 256, 3), 127, np.uint8)  # yours, of each camera",
+        f"episode.observe({{{views}}}, np.zeros((1, {width}), np.float32))  # and the robot's state",
+        "chunk = policy.act(episode)  # the next actions",
+    ]
 
 
 def front_matter(name: str, known: Mapping[str, Any]) -> str:

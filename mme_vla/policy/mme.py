@@ -72,7 +72,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
 
         Args:
             processor, config, compute_dtype, history_dtype, augment: as for `NetworkPolicy`.
-            attention: backend: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
+            attention: backend: `auto`, `sdpa`, `flex` or `varlen` (docs/evidence/hardware.md).
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
         """
         NetworkPolicy.__init__(

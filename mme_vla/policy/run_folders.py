@@ -32,7 +32,7 @@ def step_of(checkpoint: Path) -> int:
 LATEST = "latest"
 """`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
 SHIPPED = "nano"
-"""The checkpoint that ships with the library: four tokens of memory, solves VideoUnmask (docs/nano.md)."""
+"""The checkpoint that ships with the library: four tokens of memory, solves VideoUnmask (docs/train/nano.md)."""
 
 
 def find_run(path: Path) -> Path:

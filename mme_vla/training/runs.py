@@ -207,7 +207,8 @@ def weights_to_start_from(init_from: str | None) -> str | None:
     """What `init_from` names; None for random weights."""
     require(
         init_from != ASK,
-        "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
+        "This recipe starts from trained weights: give init_from=<checkpoint> "
+        "(docs/train/weights.md lists the formats). "
         "To train the whole network from random weights, say so: init_from=none.",
     )
     return None if init_from in (None, NONE) else init_from

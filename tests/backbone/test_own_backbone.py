@@ -1,4 +1,4 @@
-"""The worked example of docs/add-a-backbone.md: checked, trained with a memory by the command, asked for actions."""
+"""The worked example of docs/extend/add-a-backbone.md: checked, trained with a memory by the command, acts."""
 
 import runpy
 import sys
@@ -33,7 +33,7 @@ def findable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_page_shows_the_files_that_are_tested() -> None:
-    page = (REPOSITORY / "docs" / "add-a-backbone.md").read_text()
+    page = (REPOSITORY / "docs" / "extend" / "add-a-backbone.md").read_text()
     for file in ("regression.py", "configs/backbone/regression.yaml"):
         assert (EXAMPLE / file).read_text().strip() in page, file
 

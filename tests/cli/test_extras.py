@@ -65,6 +65,7 @@ SUFFICE = [
     Case((), "mme_vla sample --help", "full"),
     Case((), f"mme_vla.probe model=framesamp_modul backbone=tiny {TINY} recordings=sample recorded=1 with=[shuffle] "
              "draws=2 moments=1 scan=false output=probed", "shuffle"),
+    Case(("docs",), "mme_vla docs --build --output site", "index.html"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
     Case(("harness",), "mme_vla harness --help", "flow_steps"),
     Case(("orbax",), f"mme_vla weights {STEP} jax --to released", ""),
@@ -99,6 +100,7 @@ NEED = [
     Case((), f"{PLAY} player=openai", "openai", 2),
     Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
     Case((), "mme_vla harness --help", "harness", 2),
+    Case((), "mme_vla docs", "docs", 2),
     Case((), f"mme_vla weights {STEP} jax2 --to released", "orbax", 2),
     Case((), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
     Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),

@@ -1,4 +1,4 @@
-"""docs/your-robot.md, run as it stands on a generated dataset: two arms, 14 numbers, three cameras, no video."""
+"""docs/extend/your-robot.md, run as it stands on a generated dataset: two arms, 14 numbers, three cameras, no video."""
 
 import json
 import re
@@ -30,7 +30,7 @@ from mme_vla.memory.history import StorageSpec
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 
 EXAMPLE = REPOSITORY / "examples" / "bimanual"
-PAGE = (REPOSITORY / "docs" / "your-robot.md").read_text()
+PAGE = (REPOSITORY / "docs" / "extend" / "your-robot.md").read_text()
 CAMERAS = ("top", "left_wrist", "right_wrist")
 BRIEF = ["train.steps=2", "train.batch_size=2", "train.val_samples=0", "train.open_loop_chunks=1", "train.workers=0",
          "train.device=cpu", "logger=none"]  # fmt: skip

@@ -73,7 +73,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_but_for_one_random_number_tha
         weights[name] = last.read_bytes()
     same = "resumed with the random state"
     assert losses[same] == losses["uninterrupted"] and weights[same] == weights["uninterrupted"]
-    # What LeRobot 0.6.1 does, to its own policies too; once it no longer does, docs/interop.md can say less.
+    # What LeRobot 0.6.1 does, to its own policies too; once it no longer does, docs/serve/lerobot.md can say less.
     assert weights["resumed"] != weights["uninterrupted"]
 
 

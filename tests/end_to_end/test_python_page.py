@@ -1,4 +1,4 @@
-"""The code blocks of docs/python.md run, in order, as they stand there."""
+"""The code blocks of docs/start/python.md run, in order, as they stand there."""
 
 import re
 
@@ -10,13 +10,13 @@ LEFT_OUT = "left out by the test"
 
 
 def test_the_blocks_of_the_page_run(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "python.md").read_text(), re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "start" / "python.md").read_text(), re.DOTALL)
     run = [block for block in blocks if LEFT_OUT not in block]
     assert len(blocks) - 1 == len(run) >= 5
     monkeypatch.chdir(tmp_path)
     space: dict = {}
     for block in run:
-        exec(compile(block, "docs/python.md", "exec"), space)
+        exec(compile(block, "docs/start/python.md", "exec"), space)
     assert space["chunk"].shape == (20, 8)
     assert space["loss"].ndim == 0
     assert space["again"].config["name"] == "framesamp_modul"

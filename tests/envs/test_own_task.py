@@ -1,4 +1,4 @@
-"""The worked example of docs/add-a-task.md: checked, made, evaluated and recorded like the benchmark's own."""
+"""The worked example of docs/extend/add-a-task.md: checked, made, evaluated and recorded like the benchmark's own."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_page_shows_the_file_that_is_tested() -> None:
-    page = (REPOSITORY / "docs" / "add-a-task.md").read_text()
+    page = (REPOSITORY / "docs" / "extend" / "add-a-task.md").read_text()
     assert (EXAMPLE / "two_buttons.py").read_text().strip() in page
 
 

@@ -1,4 +1,4 @@
-"""The model without configuration, data and simulation: the examples of README.md and docs/python.md."""
+"""The model without configuration, data and simulation: the examples of README.md and docs/start/python.md."""
 
 import ast
 import subprocess
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import REPOSITORY
+from helpers import REPOSITORY
 
 THIRD_PARTY = {"torch", "numpy", "einops", "timm"}
 MAX_MODULES = 25
@@ -49,7 +49,7 @@ def third_party(module: str) -> set[str]:
     return roots - set(sys.stdlib_module_names) - {"mme_vla"}
 
 
-@pytest.mark.parametrize(("page", "before"), [("README.md", BATCHES), ("docs/python.md", "")])
+@pytest.mark.parametrize(("page", "before"), [("README.md", BATCHES), ("docs/start/python.md", "")])
 def test_example_trains_and_imports_little(page: str, before: str) -> None:
     code = before + example(page) + REPORT
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)

@@ -1,4 +1,4 @@
-"""The worked example of docs/add-an-integration.md: an integration outside the package is checked, learns and acts."""
+"""The worked example of docs/extend/add-an-integration.md: an integration of one's own is checked, learns and acts."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
 
 
 def test_the_page_shows_the_files_that_are_tested() -> None:
-    page = (REPOSITORY / "docs" / "add-an-integration.md").read_text()
+    page = (REPOSITORY / "docs" / "extend" / "add-an-integration.md").read_text()
     for file in ("gist.py", "configs/integration/gist.yaml"):
         assert (EXAMPLE / file).read_text().strip() in page, file
 

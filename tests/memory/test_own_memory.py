@@ -1,4 +1,4 @@
-"""The worked example of docs/add-a-memory.md: a memory outside the package builds, streams and trains."""
+"""The worked example of docs/extend/add-a-memory.md: a memory outside the package builds, streams and trains."""
 
 import json
 import os
@@ -32,15 +32,15 @@ def policy(monkeypatch):
 
 
 def test_the_page_shows_the_files_that_are_tested():
-    page = (REPOSITORY / "docs" / "add-a-memory.md").read_text()
+    page = (REPOSITORY / "docs" / "extend" / "add-a-memory.md").read_text()
     for file in ("last_frames.py", "configs/memory/last_frames.yaml", "configs/model/last_frames_context.yaml"):
         assert (EXAMPLE / file).read_text().strip() in page, file
 
 
 def test_the_pages_memory_with_a_forward_of_its_own_passes_the_check():
-    page = (REPOSITORY / "docs" / "add-a-memory.md").read_text()
+    page = (REPOSITORY / "docs" / "extend" / "add-a-memory.md").read_text()
     block = next(block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FrameMeans" in block)
-    exec(compile(block, "docs/add-a-memory.md", "exec"), {})
+    exec(compile(block, "docs/extend/add-a-memory.md", "exec"), {})
     check_memory("frame_means", budget=6)
 
 

@@ -1,11 +1,14 @@
 """The model card as the hub reads it."""
 
+import re
+from pathlib import Path
+
 import pytest
 from huggingface_hub import ModelCard
 
 from mme_vla.policy.card import model_card
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import small_policy
+from mme_vla.testing.small import small_policy, unit_stats
 
 
 @pytest.fixture(scope="module")
@@ -33,3 +36,14 @@ def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None
     assert card.data.datasets == ["lerobot/robomme"]
     assert [(r.metric_type, r.metric_value) for r in card.data.eval_results] == [("success_rate", 0.25)]
     assert "| note | one seed |" in card.text
+
+
+@pytest.mark.parametrize("model", ["pi05", "framesamp_modul"])
+def test_the_example_of_a_card_runs_to_an_action(model: str, tmp_path: Path) -> None:
+    saved = small_policy(model)
+    saved.processor.stats = unit_stats()
+    saved.save_pretrained(tmp_path)
+    (block,) = re.findall(r"```python\n(.*?)```", (tmp_path / "README.md").read_text(), re.DOTALL)
+    space: dict = {}
+    exec(block.replace("<this repository or folder>", str(tmp_path)), space)
+    assert space["chunk"].shape[-1] == 8

@@ -23,7 +23,7 @@ from helpers.serving_fakes import (
     wait_until,
 )
 from mme_vla.errors import UserError
-from mme_vla.serving import Client, Limits, PolicyServer, ServeSettings, pack
+from mme_vla.serving import Client, Limits, PolicyServer, ServeSettings, pack, unpack
 
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}  # batches of other sizes add the same numbers in another order
 
@@ -223,6 +223,20 @@ def test_what_the_policy_cannot_do_fails_for_its_client_without_a_traceback(poli
         by_challenge(client, course()[:1])
 
 
+def test_a_key_is_requested(policy):
+    with Served(policy, api_key="right") as served:
+        for key in (None, "wrong", "righ", "right2"):
+            with pytest.raises(UserError, match="Api-Key"):
+                served.client(api_key=key)
+        with served.client(api_key="right") as client:
+            by_challenge(client, course()[:1])
+
+
+def test_a_page_in_a_browser_is_refused(served):
+    with pytest.raises(Exception, match="403"):
+        connect(f"ws://127.0.0.1:{served.server.port}", origin="http://example.com")
+
+
 def test_a_full_server_says_so_and_has_capacity_again_later(policy):
     with Served(policy, encode_chunk=1, limits=Limits(connections=1)) as served, served.reading():
         busy = served.client()
@@ -336,3 +350,10 @@ def test_past_actions_need_the_frames_they_led_to():
         client.infer(request)
         with pytest.raises(UserError, match="add_buffer"):
             client.infer(request)
+
+
+def test_unpacked_metadata_is_the_first_message(served):
+    with connect(f"ws://127.0.0.1:{served.server.port}/any/path", compression=None) as raw:
+        assert unpack(raw.recv(10))["server"] == "mme_vla"
+        raw.send(pack({"reset": True}))
+        assert unpack(raw.recv(10))["reset_finished"] is True

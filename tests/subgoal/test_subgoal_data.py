@@ -226,7 +226,7 @@ def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
     recipe = [options[key] for key in ("lora_rank", "lora_alpha", "learning_rate", "warmup_ratio")]
     assert recipe == [16, 32, 1e-4, 0.05]
     assert options["per_device_train_batch_size"] * options["gradient_accumulation_steps"] * 4 == 64
-    page = (REPOSITORY / "docs" / "subgoal-training.md").read_text().replace(" \\\n ", "")
+    page = (REPOSITORY / "docs" / "train" / "subgoal-training.md").read_text().replace(" \\\n ", "")
     assert command("grounded") in page and command("grounded").endswith("swift sft swift_grounded.json")
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from helpers import commands
-from mme_vla import MMEPolicy
+from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
 from mme_vla.training.logging import read_metrics
@@ -91,3 +91,27 @@ def test_a_finished_run_holds_everything(runs: tuple[Path, str]) -> None:
     assert [line["step"] for line in lines if "train/loss" in line] == list(range(1, STEPS + 1))
     assert [line["step"] for line in lines if "val/loss" in line] == [3, 6, 9]
     assert MMEPolicy.from_pretrained(checkpoint).require_processor().stats is not None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["output=whole"], "never overwritten"),
+        (["resume=whole", "train.steps=20", "train.lr=0.5"], r"train\.lr: 0.003 then, 0.5 now"),
+        (["resume=nowhere"], "No checkpoint at nowhere"),
+        (["output=new", "train.batch_size=3", "train.accumulate=2"], r"multiple of train\.accumulate=2"),
+        (["output=new", "train.batch_size=4000"], r"fewer than train\.batch_size=4000"),
+        (["output=new", "data.sources=[missing]"], "No LeRobot dataset at 'missing'"),
+        (["output=new", "init_from=nowhere"], "No checkpoint at nowhere"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_training(
+    runs: tuple[Path, str], monkeypatch: pytest.MonkeyPatch, overrides: list[str], message: str
+) -> None:
+    base, before = runs[0], numbers(runs[0] / "whole")
+    monkeypatch.chdir(base)
+    with pytest.raises(UserError, match=message):
+        main(compose("train", [*SMALL, f"data.cache.root={base}", *overrides]))
+    assert numbers(base / "whole") == before
+    assert not (base / "new").exists()

@@ -1,0 +1,139 @@
+"""What MkDocs cannot know of the repository: generated pages, the files that pages link to, and links between them.
+
+A page links to a file beside `docs/` (`../../configs/train.yaml`) as it does on a forge. In the site such a file is a
+page of its own, with its text as a code block, so that every link works offline.
+"""
+
+import re
+from collections.abc import Callable
+from os.path import normpath, relpath
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import unquote
+
+import api_pages
+import command_pages
+import config_pages
+import notebook_pages
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File, Files
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[2]
+FROM_ROOT = {
+    "index.md": "README.md",
+    "reference/changes.md": "CHANGELOG.md",
+    "extend/contributing.md": "CONTRIBUTING.md",
+}
+"""Pages that are files of the repository's root."""
+BOOST = {"concepts": 2.0, "reference": 0.5, "evidence": 0.5}
+"""Folder → weight of its pages in the search, 1 for the others."""
+LINK = re.compile(r"(!?\[[^\]]*\]\()([^)#\s]+)(#[^)\s]*)?\)")
+LANGUAGES = {".py": "python", ".yaml": "yaml", ".json": "json", ".sh": "bash", ".toml": "toml"}
+
+
+def generated() -> dict[str, str]:
+    """Path under `docs/` → Markdown, of every page that is written at build time."""
+    copies = {page: (ROOT / file).read_text(encoding="utf-8") for page, file in FROM_ROOT.items()}
+    return {**copies, "reference/api.md": api_pages.page(), **config_pages.pages(), **command_pages.pages()}
+
+
+def on_files(files: Files, config: "MkDocsConfig") -> Files:
+    """Add the generated pages, and a page for each linked file outside `docs/`."""
+    pages = generated()
+    for path, text in pages.items():
+        files.append(File.generated(config, path, content=text))
+    texts = {**pages, **{file.src_uri: file.content_string for file in files.documentation_pages()}}
+    for target in sorted({target for path, text in texts.items() for target in outside(path, text)}):
+        files.append(File.generated(config, shown_as(target), content=source_page(target)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: "Page", **_: object) -> str:
+    """Point links to files of the repository at their pages in the site, and rank the page in the search."""
+    folder = page.file.src_uri.partition("/")[0]
+    if folder in BOOST:
+        page.meta["search"] = {"boost": BOOST[folder]}
+    return relink(page.file.src_uri, markdown)
+
+
+def origin(path: str) -> str:
+    """Where the text of a page stands in the repository, which its relative links start from."""
+    if path.startswith("source/"):
+        return path.removeprefix("source/").removesuffix(".md")
+    return FROM_ROOT.get(path, f"docs/{path}")
+
+
+def target_of(path: str, link: str) -> str | None:
+    """The file of the repository that a link on a page names; None for an address."""
+    if re.match(r"[a-z]+:|/", link):
+        return None
+    return normpath(f"{origin(path)}/../{unquote(link)}")
+
+
+def shown_as(target: str) -> str:
+    """The path in the site of a file of the repository."""
+    copies = {file: page for page, file in FROM_ROOT.items()}
+    if target in copies:
+        return copies[target]
+    return target.removeprefix("docs/") if target.startswith("docs/") else f"source/{target}.md"
+
+
+def outside(path: str, text: str) -> set[str]:
+    """The files and folders that a page links to and that are neither in `docs/` nor a page of the site.
+
+    Raises:
+        PluginError: a link leads to no file.
+    """
+    targets = set()
+    for _, link, _ in LINK.findall(without_code(text)):
+        target = target_of(path, link)
+        if target is None or not shown_as(target).startswith("source/"):
+            continue
+        if not (ROOT / target).exists():
+            raise PluginError(f"{origin(path)} links to {link}, which does not exist.")
+        targets.add(target)
+    return targets
+
+
+def without_code(text: str) -> str:
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def relink(path: str, text: str) -> str:
+    """A page's text with links to files of the repository as links between pages of the site."""
+
+    def replace(match: re.Match[str]) -> str:
+        target = target_of(path, match[2])
+        if target is None:
+            return match[0]
+        return f"{match[1]}{relpath(shown_as(target), Path(path).parent)}{match[3] or ''})"
+
+    return outside_of_code(text, lambda part: LINK.sub(replace, part))
+
+
+def outside_of_code(text: str, change: Callable[[str], str]) -> str:
+    """Apply `change` to what is not in a fenced block."""
+    parts = re.split(r"(^```.*?^```)", text, flags=re.DOTALL | re.MULTILINE)
+    return "".join(part if part.startswith("```") else change(part) for part in parts)
+
+
+def source_page(target: str) -> str:
+    """A file of the repository as a page: its text, or the names of a folder's files."""
+    path = ROOT / target
+    if path.suffix == ".ipynb":
+        return notebook_pages.page(path)
+    if path.is_dir():
+        names = sorted(str(file.relative_to(path)) for file in path.rglob("*") if is_source(file))
+        text, language = "\n".join(names), "text"
+    else:
+        text, language = path.read_text(encoding="utf-8"), LANGUAGES.get(path.suffix, "text")
+    # Five backticks: a file may hold fences of its own. The search finds pages, not files.
+    return f"---\nsearch:\n  exclude: true\n---\n\n# `{target}`\n\n`````{language}\n{text.rstrip()}\n`````\n"
+
+
+def is_source(file: Path) -> bool:
+    return file.is_file() and not {"__pycache__", "outputs"} & set(file.parts)

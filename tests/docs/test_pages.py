@@ -1,0 +1,102 @@
+"""Sizes of the pages, their navigation, and the workflows that build and test them."""
+
+import re
+from pathlib import Path
+
+import hooks
+import pytest
+import yaml
+
+from helpers import REPOSITORY
+
+DOCS = REPOSITORY / "docs"
+MAX_WORDS, MAX_WORDS_OF_ALL = 1200, 20_000
+WORKFLOWS = REPOSITORY / ".github" / "workflows"
+
+
+def prose(text: str) -> str:
+    """A page without code and tables."""
+    text = re.sub(r"`[^`]*`", " x ", re.sub(r"```.*?```", " ", text, flags=re.DOTALL))
+    return "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("|"))
+
+
+def pages() -> list[Path]:
+    """Pages written for users."""
+    written = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] != "evidence"]
+    return [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *written]
+
+
+def test_pages_are_short() -> None:
+    words = {str(page.relative_to(REPOSITORY)): len(prose(page.read_text()).split()) for page in pages()}
+    assert {page: count for page, count in words.items() if count > MAX_WORDS} == {}
+    assert sum(words.values()) <= MAX_WORDS_OF_ALL
+    assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 120
+
+
+def test_pages_have_few_semicolons() -> None:
+    text = "\n".join(prose(page.read_text()) for page in pages())
+    assert text.count(";") <= 0.05 * len(re.findall(r"[.!?](?=\s|$)", text))
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.relative_to(REPOSITORY).as_posix())
+def test_a_page_begins_with_one_title_and_its_purpose(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    assert len(re.findall(r"^# ", text, re.MULTILINE)) == 1
+    title, blank, purpose, *_ = text.splitlines()
+    assert title.startswith("# ") and not blank and len(purpose) > 20
+
+
+def test_the_navigation_has_the_tasks_of_a_user() -> None:
+    titles = [title for entry in navigation() for title in entry]
+    assert titles == ["Start", "Train", "Evaluate", "Serve", "Probe", "Extend", "Benchmark", "Evidence", "Reference"]
+
+
+def test_every_page_is_in_the_navigation_once() -> None:
+    listed = list(leaves(navigation()))
+    written = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
+    assert sorted(listed) == sorted(written | set(hooks.generated()))
+
+
+def test_the_documentation_workflow_builds_the_site() -> None:
+    runs = list(steps("docs.yml"))
+    assert any(run.endswith("mme-vla docs --build") for run in runs)
+
+
+def test_the_test_workflow_runs_the_commands_of_the_readme() -> None:
+    readme = (REPOSITORY / "README.md").read_text()
+    commands = re.findall(r"^((?:pip install uv && .*|)uv run (?:--extra dev|python).*)$", readme, re.MULTILINE)
+    assert len(commands) == 3
+    assert set(commands) <= set(steps("tests.yml"))
+
+
+def steps(workflow: str) -> list[str]:
+    """The shell commands of a workflow, which runs on changes to `main` and on pull requests."""
+    content = yaml.safe_load((WORKFLOWS / workflow).read_text())
+    events = content[True]  # YAML reads the key `on` so
+    assert events["push"] == {"branches": ["main"]} and "pull_request" in events
+    assert content["permissions"] == {"contents": "read"}
+    jobs = content["jobs"].values()
+    for job in jobs:
+        assert all(set(step) & {"run", "uses"} for step in job["steps"])
+        assert all(re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step)
+    return [step["run"] for job in jobs for step in job["steps"] if "run" in step]
+
+
+class Loader(yaml.SafeLoader):
+    """Reads MkDocs's settings, which name a Python function."""
+
+
+Loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
+
+
+def navigation() -> list[dict]:
+    return yaml.load((REPOSITORY / "mkdocs.yml").read_text(), Loader)["nav"]
+
+
+def leaves(entries: list) -> list[str]:
+    """The pages below entries of the navigation."""
+    found = []
+    for entry in entries:
+        below = next(iter(entry.values())) if isinstance(entry, dict) else entry
+        found += [below] if isinstance(below, str) else leaves(below)
+    return found

@@ -1,0 +1,144 @@
+"""docs/start/first-hour.md: its notebooks and its shortest path run, and it shows the files that run."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from shutil import copytree, ignore_patterns
+from typing import Any
+
+import pytest
+
+from helpers import REPOSITORY
+from mme_vla.envs.rendering import render_backend
+from mme_vla.errors import UserError
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.testing import check_memory
+
+EXAMPLE = REPOSITORY / "examples" / "first_hour"
+PAGE = REPOSITORY / "docs" / "start" / "first-hour.md"
+SMALL_POLICY = "train.steps=2 train.val_samples=2 train.open_loop_chunks=1 backbone.depth=1 backbone.vision.depth=1"
+SETTINGS = {
+    "01_train.ipynb": {"OPTIONS": f'"{SMALL_POLICY}"'},
+    "02_closed_loop.ipynb": {"EPISODES": "[0]", "MAX_STEPS": "3"},
+    "03_own_memory.ipynb": {
+        "DEMONSTRATIONS": "2", "UPDATES": "1", "EPISODES": "1",
+        "MORE": '"films=false train.batch_size=2 train.val_samples=2"',
+    },
+    "04_probe.ipynb": {"POLICY": '"nano"', "EPISODES": '"[4]"', "ARMS": '["drop:all"]', "DRAWS, DECISIONS": "2, 1"},
+}  # fmt: skip
+"""Notebook → values of its first cell that shorten the run."""
+
+
+def code_cells(name: str) -> list[dict[str, Any]]:
+    cells = json.loads((EXAMPLE / name).read_text())["cells"]
+    return [cell for cell in cells if cell["cell_type"] == "code"]
+
+
+def source_of(cell: dict[str, Any], settings: dict[str, str]) -> str:
+    """The code of a cell with other settings, its shell commands as calls."""
+    lines = "".join(cell["source"]).splitlines()
+    for number, line in enumerate(lines):
+        name, equals, _ = line.partition(" = ")
+        if equals and name in settings:
+            lines[number] = f"{name} = {settings[name]}"
+        elif line.lstrip().startswith("!"):
+            indent, command = line.split("!", 1)
+            lines[number] = f"{indent}shell(f'''{command}''')"
+    return "\n".join(lines)
+
+
+def shell(command: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    words = ["bash", "-o", "pipefail", "-c", command]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def require_rendering() -> None:
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(f"cannot render here: {error}")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SETTINGS)
+def test_the_cells_of_a_notebook_run(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if name != "01_train.ipynb":
+        require_rendering()
+    copytree(EXAMPLE, tmp_path / "folder", ignore=ignore_patterns("outputs"))
+    monkeypatch.chdir(tmp_path / "folder")
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.syspath_prepend(tmp_path / "folder")
+    space: dict[str, Any] = {"shell": shell}
+    for number, cell in enumerate(code_cells(name)):
+        exec(compile(source_of(cell, SETTINGS[name]), f"{name}, cell {number}", "exec"), space)
+    assert any(Path("outputs").rglob("*.json*"))
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_notebook_keeps_the_outputs_of_a_full_run(name: str) -> None:
+    cells = code_cells(name)
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = json.dumps([cell["outputs"] for cell in cells])
+    assert "Traceback" not in outputs
+    assert "image/png" in outputs or "text/html" in outputs or "text/markdown" in outputs
+    assert (EXAMPLE / name).stat().st_size < 1_000_000
+
+
+def test_each_setting_is_one_of_its_notebook() -> None:
+    for name, settings in SETTINGS.items():
+        first = "".join(code_cells(name)[0]["source"])
+        assert all(f"\n{key} = " in f"\n{first}" for key in settings), name
+
+
+def test_the_page_shows_the_files_of_the_example() -> None:
+    page = PAGE.read_text()
+    for file in ("video_frames.py", "configs/model/video_frames_modul.yaml"):
+        assert (EXAMPLE / file).read_text().strip() in page, file
+
+
+def test_the_memory_of_the_page_passes_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(EXAMPLE)
+    import video_frames  # noqa: F401
+
+    check_memory("video_frames", budget=4, grid=1)
+
+
+def shortest_path() -> list[str]:
+    """The commands of the page's last section that follow the installation."""
+    section = PAGE.read_text().partition("## The shortest path")[2]
+    return re.findall(r"```bash\n(.*?)```", section, re.DOTALL)[1].strip().splitlines()
+
+
+@pytest.mark.slow
+def test_the_shortest_path_leads_to_a_memory_in_closed_loop(tmp_path: Path) -> None:
+    require_rendering()
+    unneeded = ignore_patterns(".*", "__pycache__", "outputs", "tests", "docs", "*.egg-info")
+    clone = copytree(REPOSITORY, tmp_path / "clone", ignore=unneeded)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "PYTHONPATH": str(clone)}
+    script = "\n".join(["set -e", *shortest_path(), "python -c 'import mme_vla; print(mme_vla.__file__)'"])
+    done = subprocess.run(["bash", "-c", script], cwd=clone, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().endswith(f"{clone}/mme_vla/__init__.py")
+    output = clone / "examples" / "first_hour" / "outputs" / "small"
+    records = read_folders(find_records([output]))
+    assert sorted((record.model.partition("-")[0], record.episode) for record in records) == [
+        (model, episode) for model in ("pi05", "video_frames_modul") for episode in range(4)
+    ]
+    solved = {record.model.partition("-")[0] for record in records if record.success}
+    assert "pi05" not in solved, "a policy without memory cannot know the container"
+    assert "| video_frames_modul | 4 |" in (output / "page.md").read_text()
+
+
+def test_the_times_of_the_shortest_path_add_up() -> None:
+    section = PAGE.read_text().partition("## The shortest path")[2]
+    rows = {cells[0].strip(): cells[1] for line in section.splitlines() if (cells := line.split("|")[1:-1])}
+    parts = ["check", "40 demonstrations", "training, with and without memory", "evaluation, four episodes each"]
+    seconds = sum(int(number) for part in parts for number in re.findall(r"\d+", rows[part]))
+    assert abs(seconds - int(rows["in all, from the check on"])) <= 20
