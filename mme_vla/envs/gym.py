@@ -3,7 +3,7 @@
 >>> gymnasium.make("mme_vla/StopCube-v0", images=False)  # doctest: +SKIP
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -23,7 +23,7 @@ SPACES = ("joint_angle", "ee_pose", "waypoint")
 _STATE = ARM_JOINTS + 1
 
 
-class GymTask(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
+class GymTask(gymnasium.Env[Any, np.ndarray]):
     """A task whose reset samples an episode of a split.
 
     Observations are a dict of `state` [8] (joints in radians, first finger in metres) and, with `images`, `front` and
@@ -110,12 +110,12 @@ class GymTask(gymnasium.Env[dict[str, np.ndarray], np.ndarray]):
         """The environment of an episode; the last one stays open."""
         if self._env is None or number != self._number:
             self.close()
-            env: Any = make_env(self.task, self.split, number, render=self.images, **self._options)  # type: ignore[arg-type]
+            env: Any = make_env(self.task, self.split, number, render=self.images, **self._options)
             self._env, self._number = env, number
         assert self._env is not None
         return self._env
 
-    def _take(self, frames: dict[str, Sequence[Any]]) -> None:
+    def _take(self, frames: Mapping[str, Sequence[Any]]) -> None:
         state = benchmark_state(frames["joint_state_list"][-1], frames["gripper_state_list"][-1])
         views = {name: np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8) for name in CAMERAS if self.images}
         self._observation = {**views, "state": state}
