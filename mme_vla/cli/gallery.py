@@ -98,9 +98,9 @@ def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
     """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
     from mme_vla.envs.scene.placement import SceneError
 
-    for seed in range(spec.seed, spec.seed + 100):
+    for seed in range(spec.seed, spec.seed + (1 if spec.row else 100)):
         try:
-            env = make_task(spec.task, render=True, seed=seed, difficulty=spec.difficulty)
+            env = make_task(spec.task, render=True, **spec.options | {"seed": seed})
         except SceneError:
             continue
         snapshots, success = demonstrate_with_images(env)

@@ -45,6 +45,8 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
     specs = choose_episodes(named_tasks(config), config["episodes"], config["split"], config["env"])
+    if config["max_steps"] is None:
+        config["max_steps"] = environment(config["env"]).step_limit(config["split"])
     settings: dict[str, Any] = asdict(read_section(PlaySettings, config, others=True))
     settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
     human = player["name"] == HUMAN

@@ -18,6 +18,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.rows import task_options
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
@@ -50,6 +51,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     draft = folder / f"{job.name}.writing"
     for seed in range(job.seed, job.seed + job.retries):
         scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
+        scene |= {} if job.row is None else task_options(job.row)
         blind: Recording | None = None
         try:
             request = None if job.frames is None else job.frames.beforehand()
@@ -181,7 +183,16 @@ def plan(cfg: "DictConfig") -> list[Job]:
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
     frames = _frame_choice(cfg)
     return [
-        Job(s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None, cfg.retries, frames)
+        Job(
+            s.task,
+            s.episode,
+            s.seed,
+            s.difficulty,
+            s.recovery if cfg.recovery else None,
+            cfg.retries if s.row is None else 1,
+            frames,
+            s.row,
+        )
         for s in specs
     ]
 

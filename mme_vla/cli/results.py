@@ -10,12 +10,12 @@ from pathlib import Path
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
-from mme_vla.envs.metadata import FURTHER_SPLITS
+from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
-from mme_vla.evaluation.results.curves import Curves, process_tables, stress_curves, stress_figures, stress_table
+from mme_vla.evaluation.results.curves import process_tables, stress_curves, stress_figures, stress_table
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import read_runs, training_details
 from mme_vla.evaluation.results.scopes import TASK_FACTS, TEST_EPISODES, Protocol, tasks_of
@@ -66,7 +66,11 @@ def run(args: argparse.Namespace) -> None:
         args.confidence, args.samples, args.seed,
     )  # fmt: skip
     if args.stress:
-        show_curves(stress_curves(records, args.confidence, args.conflicts), args)
+        curves = stress_curves(records, args.confidence, args.conflicts)
+        show_tables([stress_table(curves)], stress_figures(curves), "Episodes that every place of the dial has.", args)
+        return
+    if args.ood:
+        show_ood(records, args)
         return
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
@@ -90,23 +94,34 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     if own and not any(record.task in TASK_FACTS for record in records):
         return 1 + max(own)
     splits = {record.split for record in records if split in (None, record.split)}
-    counts = {FURTHER_SPLITS.get(str(name), TEST_EPISODES) for name in splits}
+    known = {**FURTHER_SPLITS, HARD: HARD_EPISODES}
+    counts = {known.get(str(name), TEST_EPISODES) for name in splits}
     return counts.pop() if len(counts) == 1 else TEST_EPISODES
 
 
-def show_curves(curves: Curves, args: argparse.Namespace) -> None:
-    """Print success over the dials, and write it where a file is named."""
+def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
+    """Print RoboMME-OOD by tier, the hard episodes, twins and extrapolation, and write them where a file is named."""
+    from mme_vla.evaluation.results import ood
+
+    how = records, args.confidence, args.conflicts
+    curves = ood.extrapolation(*how)
+    tables = [*ood.tier_tables(*how), ood.hard_table(*how), ood.twin_table(*how), ood.extrapolation_table(curves)]
+    caption = "All splits of a run together; the training range is shaded."
+    show_tables([table for table in tables if table], ood.extrapolation_figures(curves), caption, args)
+
+
+def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace) -> None:
+    """Print tables, and write them, with figures, where a file is named."""
     from mme_vla.evaluation.results.report import Section, html_page
 
-    table = stress_table(curves)
-    print_table(table, 200)
     texts: dict[Path, str] = {}
+    for table in tables:
+        print_table(table, 200)
     if args.markdown:
-        texts[args.markdown] = to_markdown(table)
+        texts[args.markdown] = "\n".join(map(to_markdown, tables))
     if args.html:
-        caption = "Episodes that every place of the dial has."
-        boxes = [Section(name, figure, caption=caption) for name, figure in stress_figures(curves).items()]
-        texts[args.html] = html_page(args.title, [*boxes, Section(table.title, tables=[table])])
+        boxes = [Section(name, figure, caption=caption) for name, figure in figures.items()]
+        texts[args.html] = html_page(args.title, [*boxes, *(Section(table.title, tables=[table]) for table in tables)])
     _write(texts)
 
 
@@ -172,6 +187,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--html", type=Path, help="one self-contained page with plots")
     parser.add_argument("--title", default="RoboMME results", help="of the page")
     parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
+    parser.add_argument("--ood", action="store_true",
+                        help="RoboMME-OOD by tier beside published figures, twins, extrapolation")  # fmt: skip
     parser.add_argument("--brief", action="store_true", help="print the overview only")
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)")
     parser.add_argument("--episodes", type=int, help="episodes of a task (default: as the split has)")

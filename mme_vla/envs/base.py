@@ -105,15 +105,20 @@ class Environment(ABC):
         require(exists, f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
         return known[number]
 
+    def step_limit(self, split: str) -> int:
+        """Steps after which an episode of a split is a timeout."""
+        return 1300
+
     def suite_of(self, task: str) -> str | None:
         """The suite of a task."""
         return next((suite for suite, tasks in self.suites.items() if task in tasks), None)
 
-    def open(self, task: str, split: str, episode: int, *, action_space: str | None = None, max_steps: int = 1300,
+    def open(self, task: str, split: str, episode: int, *, action_space: str | None = None, max_steps: int | None = None,
              render: bool = True) -> Any:  # fmt: skip
         """One episode with the interface of `make_env`: lists of frames, status, goal."""
         spec = self.episode(task, split, episode)
-        return EpisodeEnv(self, self.make(spec, render), spec, max_steps, action_space == CHOICES)
+        limit = max_steps or self.step_limit(split)
+        return EpisodeEnv(self, self.make(spec, render), spec, limit, action_space == CHOICES)
 
 
 def environment(name: str) -> Environment:

@@ -25,6 +25,10 @@ class RoboMME(Environment):
         """A split of the benchmark, or a variant."""
         metadata.check_split(split)
 
+    def step_limit(self, split: str) -> int:
+        """As many as the benchmark allows."""
+        return metadata.step_limit(split)
+
     def check_installed(self) -> None:
         """The simulator."""
         make.require_simulator()

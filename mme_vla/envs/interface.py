@@ -5,7 +5,7 @@ frame, or all frames of the motion in the action spaces that plan. Images appear
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
@@ -50,7 +50,7 @@ class EpisodeState:
     Positions and velocities are not enough: contacts, the solver's last solution and the script's variables belong to
     the state as well. A replay without images takes about two milliseconds a control step. Can be pickled.
 
-    task, seed, difficulty, recovery, in_view, stress: the scene. action_space, max_steps: of the environment.
+    task, seed, difficulty, recovery, in_view, stress, row: the scene. action_space, max_steps: of the environment.
     options: of the reset. actions: all that were given to `step` since.
     """
 
@@ -60,6 +60,7 @@ class EpisodeState:
     recovery: str | None
     in_view: bool
     stress: dict[str, int]
+    row: Mapping[str, Any] | None
     action_space: str
     max_steps: int
     options: dict[str, Any]
@@ -230,7 +231,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _state(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
         task = self.task
-        scene = type(task).__name__, task.seed, task.difficulty, task.recovery, task.in_view, task.stress
+        scene = type(task).__name__, task.seed, task.difficulty, task.recovery, task.in_view, task.stress, task.row
         return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
 
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
@@ -278,8 +279,15 @@ class RoboMMEEnv(gymnasium.Env):
 
     @property
     def difficulty(self) -> str:
-        """`easy`, `medium` or `hard`; read by the released evaluation script."""
-        return self.task.difficulty
+        """`easy`, `medium` or `hard`, or the tier of RoboMME-OOD; read by the released evaluation script."""
+        return self.task.tier or self.task.difficulty
+
+    def scene_values(self) -> dict[str, Any]:
+        """The row of this scene, plain values; `make_env(…, row=row)` or a line of a JSONL file builds it again.
+
+        What is sampled when an episode begins belongs to it, so call it after `reset`.
+        """
+        return self.task.scene_values()
 
     @property
     def began(self) -> list[int]:

@@ -1,5 +1,6 @@
 """`make_env`: one benchmark episode as an environment, in one line."""
 
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -31,7 +32,8 @@ def make_env(
     seed: int | None = None,
     difficulty: str | None = None,
     recovery: str | None = None,
-    max_steps: int = 1300,
+    max_steps: int | None = None,
+    row: Mapping[str, Any] | None = None,
     render: bool = True,
     reward: str = "none",
     env: str = "mme_vla",
@@ -42,15 +44,17 @@ def make_env(
 
     Args:
         task: one of the 16 task names, or a task of your own registered in `TASKS`.
-        split: `train`, `val` or `test`; `twin` or `stress:<dial>=<n>` for variants of the latter; `further` for 100
-            scenes beyond it.
+        split: `train`, `val`, `test`, `hard`, `challenge`, `ood`, `ood:<tier>`, or a JSONL file of scenes; `twin` or
+            `stress:<dial>=<n>` for variants of the test split, `twin:<split>` of another; `further` for 100 scenes
+            beyond it.
         episode: which episode of the split.
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
         recovery: `z` or `xy`: sample as recovery demonstrations do, such as train episodes 0-5 (it changes the order of
             BinFill's colours); by default nothing, as in the official evaluation.
-        max_steps: control steps until the status becomes `timeout`.
+        max_steps: control steps until the status becomes `timeout`; by default as many as the split allows.
+        row: builds the scene of these values (`env.scene_values()`) instead of an episode of the split.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
             share for each sub-task of the execution as it is done, 1 in all.
@@ -69,19 +73,22 @@ def make_env(
         return _open_own(env, task, split, episode, options)
     check_names(task, action_space, difficulty, seed)
     check_sessions(split, sessions)
+    max_steps = metadata.step_limit(split) if max_steps is None else max_steps
     if env == "official":
         require(
-            seed is None and recovery is None and render and reward == "none",
-            'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, render, '
-            "reward.",
+            seed is None and row is None and recovery is None and render and reward == "none",
+            'env="official" takes episodes of a split, renders and gives no reward: leave out seed, row, '
+            "recovery, render, reward.",
         )
         return make_official_env(task, split, episode, action_space, max_steps, include)
-    variant: dict[str, Any] = {}
-    if seed is None:
-        spec = metadata.episode(task, split, episode)
-        seed, difficulty = spec.seed, spec.difficulty
-        varied = metadata.check_split(split)
-        variant = {} if varied is None else varied.options
+    scene: dict[str, Any] = {"seed": seed, "difficulty": difficulty}
+    if row is not None:
+        spec = metadata.read_row(row)
+        fits = spec.task == task and seed is None
+        require(fits, f"row is a scene of {spec.task} with its own seed: name that task, and leave out seed.")
+        scene = spec.options
+    elif seed is None:
+        scene = metadata.episode(task, split, episode).options
     if action_space == "multi_choice":
         # A policy that chooses a pixel needs the front camera's matrices.
         include = include | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
@@ -90,7 +97,7 @@ def make_env(
     require_simulator()
     from mme_vla.envs.interface import RoboMMEEnv
 
-    scene = {"seed": seed, "difficulty": difficulty, "recovery": recovery, **variant}
+    scene |= {} if recovery is None else {"recovery": recovery}
     return RoboMMEEnv(make_task(task, render=render, obs_mode=obs_mode, **scene), action_space, max_steps, included,
                       render, reward)  # fmt: skip
 

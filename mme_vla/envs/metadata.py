@@ -9,13 +9,15 @@ official files are preferred: the installed package `robomme`, or the folder wit
 import csv
 import os
 import re
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from mme_vla.envs.rows import OOD, check_row, is_row_split, rows_of, task_options
 from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
 from mme_vla.utils import read_json
@@ -49,22 +51,37 @@ what is shown and the execution. path: discs more on the way. distractors: more 
 SESSIONS = "sessions"
 """Unrelated episodes before the actual one, in the same memory: a dial of all tasks that leaves scenes unchanged."""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
+HARD, CHALLENGE = "hard", "challenge"
+"""The test split's hard episodes (its numbers 3, 7, …, 47), and the held-out scenes of the 2026 challenge."""
+HARD_EPISODES = 12
+"""Episodes a task has in `hard`."""
+STEPS = {CHALLENGE: 1500, OOD: 1800}
+"""Control steps that a split allows, where it is not `DEFAULT_STEPS`; `ood` also means its tiers."""
+DEFAULT_STEPS = 1300
+
+
+def step_limit(split: str) -> int:
+    """Control steps that an episode of a split may take, the conditioning video not counted."""
+    variant = read_variant(split)
+    base = split if variant is None else variant.base
+    return STEPS.get(OOD if is_row_split(base) else base, DEFAULT_STEPS)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """How the scenes of a split differ from the test split's. dial, turned: of a stress split."""
+    """How the scenes of a split differ from those of another. dial, turned: of a stress split."""
 
     twin: bool = False
     dial: str = ""
     turned: int = 0
+    base: str = BASE
+    """The split whose scenes are varied."""
 
     @property
     def options(self) -> dict[str, Any]:
         """Keyword arguments of the task."""
-        if self.twin:
-            return {"in_view": True}
-        return {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
+        stress = {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
+        return stress | ({"in_view": True} if self.twin else {})
 
     @property
     def sessions(self) -> int:
@@ -85,6 +102,10 @@ def read_variant(split: str) -> Variant | None:
     """The variant that a split names; None for any other text."""
     if split == TWIN:
         return Variant(twin=True)
+    if str(split).startswith(f"{TWIN}:"):
+        base = split.removeprefix(f"{TWIN}:")
+        varied = read_variant(base)
+        return Variant(twin=True, base=base) if varied is None else replace(varied, twin=True)
     if not str(split).startswith(STRESS):
         return None
     match, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
@@ -97,7 +118,7 @@ def read_variant(split: str) -> Variant | None:
 
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
-"""Episodes a task has in each split."""
+"""Episodes a task has in each split of the benchmark."""
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
 FURTHER, FURTHER_EPISODES = "further", 100
@@ -106,6 +127,7 @@ _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
 """Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
 _COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS}
+KNOWN = (*_COUNTS, HARD, CHALLENGE, OOD)
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _TEST_SEED = (500_000, 10_000)
 _FIRST_SEED = {
@@ -124,6 +146,17 @@ class EpisodeSpec:
     episode: int
     seed: int
     difficulty: str
+    """`easy`, `medium` or `hard`; in RoboMME-OOD the tier."""
+    row: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+    """The scene's values, where they are not sampled from the seed."""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of the task that make this episode's scene."""
+        variant = read_variant(self.split)
+        varied = {} if variant is None else variant.options
+        scene = {"seed": self.seed, "difficulty": self.difficulty} if self.row is None else task_options(self.row)
+        return scene | varied
 
     @property
     def recovery(self) -> str | None:
@@ -159,7 +192,8 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`; a variant of the latter (`Variant`), whose seeds are the same; or `more`,
+        split: `train`, `val` or `test`; `hard`, the hard ones of the latter; `challenge`; `ood` or `ood:<tier>`; the
+            path of a JSONL file of scenes (`rows`); a variant (`Variant`), whose seeds are the same; or `more`,
             900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
             gives after its own 50 (number 0 is what number 50 would be; no seed was raised), or `further_easy`,
             `further_medium`, `further_hard`, 400 of one difficulty by the same rule.
@@ -170,7 +204,19 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     variant = check_split(split)
     if variant is not None:
         variant.check(task)
-        return [replace(spec, split=split) for spec in episodes(task, BASE, folder)]
+        return [replace(spec, split=split) for spec in episodes(task, variant.base, folder)]
+    if split == HARD:
+        hard = [spec for spec in episodes(task, BASE, folder) if spec.difficulty == HARD]
+        return [replace(spec, split=split, episode=i) for i, spec in enumerate(hard)]
+    if is_row_split(split):
+        rows = rows_of(task, split, all_tasks())
+        levels = [row.get("tier") or row.get("difficulty", HARD) for row in rows]
+        return [
+            EpisodeSpec(task, split, i, row["seed"], level, row)
+            for i, (row, level) in enumerate(zip(rows, levels, strict=True))
+        ]
+    if split == CHALLENGE and task in TASK_NAMES:
+        return list(_table(split)[task])
     if task not in TASK_NAMES or split not in SPLITS:
         return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
@@ -187,14 +233,35 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 def check_split(split: str) -> Variant | None:
     """Make sure that a split exists; returns its variant where it has one."""
     variant = read_variant(split)
-    if variant is None:
-        check_known("split", split, [*_COUNTS, TWIN, STRESS])
+    base = split if variant is None else variant.base
+    if base not in KNOWN and not is_row_split(base):
+        known = f"{did_you_mean(str(base), [*KNOWN, TWIN, STRESS])} A file of scenes ends in .jsonl."
+        raise UserError(f"Unknown split {split!r}. {known}")
     return variant
+
+
+def is_other(split: str) -> bool:
+    """Whether a split has other episodes than those that the paper's figures are about."""
+    variant = read_variant(split)
+    base = split if variant is None else variant.base
+    return base in FURTHER_SPLITS or base in (HARD, CHALLENGE) or is_row_split(base)
+
+
+def all_tasks() -> tuple[str, ...]:
+    """The benchmark's tasks and the user's own."""
+    return (*TASK_NAMES, *(task for task in TASKS if task not in TASK_NAMES))
+
+
+def read_row(value: Any) -> EpisodeSpec:
+    """The episode that one row of values describes, as `env.scene_values()` gives it."""
+    row = check_row(value, "The row", all_tasks())
+    return EpisodeSpec(row["task"], "rows", 0, row["seed"], row.get("tier") or row.get("difficulty", HARD), row)
 
 
 def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:
     """One episode of a split."""
     known = episodes(task, split, folder)
+    require(known, f"{task} has no episodes in split {split!r}.")
     exists = type(index) is int and 0 <= index < len(known)
     require(exists, f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
     return known[index]

@@ -12,6 +12,7 @@ import torch
 from mme_vla.envs.scene.motions import Cue, build_cue, show_cue
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.stage import Stage
+from mme_vla.envs.scene.values import Values
 from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 
@@ -28,6 +29,8 @@ class Task(Stage):
         recovery: `z` or `xy` samples the pick that a recovery demonstration fails once.
         stress: how far dials are turned (`metadata.DIALS`); at 0 the scene is the benchmark's.
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
+        row: the scene's values (`metadata.SceneRow`); nothing is sampled then, and its `tier`, if it has one, brings
+            the rules of RoboMME-OOD.
         second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
         does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for `recovery`.
     """
@@ -52,6 +55,7 @@ class Task(Stage):
         robomme_failure_recovery_mode: str | None = None,
         stress: Mapping[str, int] | None = None,
         in_view: bool = False,
+        row: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         require(seed >= 0, f"seed is {seed}; expected a non-negative integer.")
@@ -68,6 +72,9 @@ class Task(Stage):
             can_turn = dial in self.dials and turned >= 0
             require(can_turn, f"{type(self).__name__} cannot turn {dial!r} by {turned}: {dials}")
         self.in_view = in_view
+        self.row = row
+        """The scene's values, where it is not sampled from its seed."""
+        self.tier = (row or {}).get("tier") or ""
         self.stress = {dial: turned for dial, turned in (stress or {}).items() if turned}
         """Dials that are turned, and how far."""
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
@@ -129,6 +136,8 @@ class Task(Stage):
 
     def _load_scene(self, options: dict) -> None:
         self.set_up()
+        row = self.row or {}
+        self.values = Values(row.get("spec"), str(row.get("where", f"{type(self).__name__}, seed {self.seed}")))
         draws = Draws(self.seed)
         self.plan(draws)
         if not self.shared_draws:
@@ -148,13 +157,27 @@ class Task(Stage):
             self.start_episode(self.draws)
             subtasks = self.subtasks()
             if self.recovery and (attempt == 0 or self.recovery_sampled_per_episode):
-                self.failed_pick = self.draw_failed_pick(self.draws, sum(s.pick and not s.video for s in subtasks))
+                self.failed_pick = self._failed_pick(sum(s.pick and not s.video for s in subtasks))
         self.progress = Progress(subtasks, self.latch_failure)
         self._show_cues()
 
-    def draw_failed_pick(self, draws: Draws, picks: int) -> int | None:
-        """Which pick of the execution a recovery demonstration fails first; None where there is none to fail."""
-        return draws.integer(0, picks) if picks else None
+    def _failed_pick(self, picks: int) -> int | None:
+        if not picks:
+            return None
+        return self.values.integer(
+            "actions.failed_pick", lambda: self.draw_failed_pick(self.draws, picks), most=picks - 1
+        )
+
+    def scene_values(self) -> dict[str, Any]:
+        """The row of this scene: `make_env` builds the same scene from it, to the last bit."""
+        names = {"recovery": self.recovery, "tier": self.tier, "in_view": self.in_view}
+        facts = {name: value for name, value in names.items() if value}
+        scene = {"task": type(self).__name__, "seed": self.seed, "difficulty": self.difficulty}
+        return scene | facts | {"spec": self.values.copy().spec}
+
+    def draw_failed_pick(self, draws: Draws, picks: int) -> int:
+        """Which of the execution's `picks` a recovery demonstration fails first."""
+        return draws.integer(0, picks)
 
     # A step -------------------------------------------------------------------------------------------------------
 

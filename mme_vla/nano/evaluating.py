@@ -56,7 +56,7 @@ def _planned(spec: EpisodeSpec) -> Motions | None:
     from mme_vla.envs.scene.placement import SceneError
 
     try:
-        env = make_task(spec.task, render=False, seed=spec.seed, difficulty=spec.difficulty)
+        env = make_task(spec.task, render=False, **spec.options)
     except SceneError:
         return None
     try:

@@ -145,7 +145,7 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
         return _observation(message, robot)
     keys = [key for key in message if isinstance(key, str)][:10]
     require(
-        not keys or set(keys) > set(KNOWN),  # flags: true was handled above
+        not keys or not set(keys) <= set(KNOWN),  # flags: true was handled above
         f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
         "keys observation/image, … or front_rgb_list, …",
     )

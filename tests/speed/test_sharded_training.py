@@ -9,6 +9,7 @@ import torch
 
 from helpers import commands, sharded_runs
 from helpers.sharded_runs import RUNS, trainer
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
@@ -120,9 +121,9 @@ def test_what_cannot_be_shared_is_reported_in_words() -> None:
     with pytest.raises(UserError, match="torchrun"):
         ParallelSettings("fsdp").shards(torch.device("cpu"))
     with pytest.raises(UserError, match="Did you mean 'fsdp'"):
-        ParallelSettings("fspd")
-    with pytest.raises(UserError, match="at least 1"):
-        ParallelSettings(replicate=0)
+        read_section(ParallelSettings, {"strategy": "fspd"}, "train.parallel")
+    with pytest.raises(UserError, match=r"train\.parallel\.replicate=0 must be a whole number, 1 or more"):
+        read_section(ParallelSettings, {"replicate": 0}, "train.parallel")
     assert not ParallelSettings().shards(torch.device("cpu"))
 
 

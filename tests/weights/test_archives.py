@@ -87,7 +87,7 @@ def test_a_folder_on_the_hub_is_fetched_alone(
     report = start_from(fresh, f"Yinpei/mme_vla_suite/{VARIANT}")
     assert same(fresh, policy) and " 0 new" in report
     assert requests == [("Yinpei/mme_vla_suite", None, [VARIANT, f"{VARIANT}/*"])]
-    with pytest.raises(UserError, match="has no 'perceptual-nothing'"):
+    with pytest.raises(UserError, match="nothing called 'perceptual-nothing'"):
         start_from(fresh, "Yinpei/mme_vla_suite/perceptual-nothing")
 
 

@@ -13,7 +13,7 @@ from mme_vla.utils import read_json
 
 def goal_of(spec: EpisodeSpec) -> str:
     """The goal of an episode as policies are told it; its scene is built for that, without images."""
-    env = make_task(spec.task, render=False, seed=spec.seed, difficulty=spec.difficulty)
+    env = make_task(spec.task, render=False, **spec.options)
     try:
         goal: str = env.goals()[0].lower()
         return goal

@@ -1,7 +1,7 @@
 """The outputs of a recording: a LeRobot dataset, official files, or both."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,6 +108,8 @@ class Job:
     retries: int
     frames: FrameChoice | None = None
     """The rendered frames; None: all."""
+    row: Mapping[str, Any] | None = None
+    """The scene's values, where it is not sampled from the seed."""
 
     @property
     def name(self) -> str:
@@ -118,7 +120,8 @@ class Job:
     def plan(self) -> dict[str, Any]:
         """What decides the result; without `frames` where all are rendered, as in older plans."""
         plan = asdict(self) | {"frames": self.frame_selection}
-        return plan if self.frames is not None else {k: v for k, v in plan.items() if k != "frames"}
+        absent = [name for name in ("frames", "row") if getattr(self, name) is None]
+        return {key: value for key, value in plan.items() if key not in absent}
 
     @property
     def frame_selection(self) -> dict[str, Any] | None:

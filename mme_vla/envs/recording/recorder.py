@@ -58,15 +58,15 @@ def _ended(env: "Task") -> bool:
     return env.progress.succeeded or env.progress.failed
 
 
-MAX_STEPS = 2000
-"""Control steps after which a recording is given up."""
+MAX_STEPS, MAX_STEPS_OOD = 2000, 4000
+"""Control steps after which a recording is given up: the benchmark's, and of the longer scenes of RoboMME-OOD."""
 SEAM, AT_REST = 5e-8, 1e-5  # rad
 GRIPPER_CLOSED = 0.03
 """Finger position below which the gripper counts as closed, metres."""
 
 
 class TooLongError(RuntimeError):
-    """A demonstration took more than `MAX_STEPS` control steps."""
+    """A demonstration took more control steps than `MAX_STEPS`, or `MAX_STEPS_OOD`."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,9 @@ class Recorder:
         return self._result
 
     def _step(self, action: np.ndarray) -> None:
-        if self._result.steps >= MAX_STEPS:
-            raise TooLongError(f"not done after {MAX_STEPS} control steps")
+        limit = MAX_STEPS_OOD if self._task.tier else MAX_STEPS
+        if self._result.steps >= limit:
+            raise TooLongError(f"not done after {limit} control steps")
         self._action = np.asarray(action, np.float64)
         self._task.step(np.asarray(action, np.float32))
         self._result.steps += 1

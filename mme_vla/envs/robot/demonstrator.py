@@ -7,6 +7,7 @@ import sapien
 
 from mme_vla.envs.robot.control import CLOSE, OPEN, PlanningError, RobotControl
 from mme_vla.envs.robot.gripper_skills import GripperPrimitives, pointing_down, turned
+from mme_vla.envs.robot.robots import ROBOT_BASE
 from mme_vla.envs.scene.articulated import Peg
 from mme_vla.envs.scene.objects import H
 from mme_vla.envs.scene.things import Thing
@@ -26,6 +27,9 @@ INSERT_START, INSERT_NEAR, INSERT_PAST, INSERT_RAISED = 0.2, 0.15, 0.05, 0.15
 
 class PegPrimitives(RobotControl):
     """The primitives of tasks in which cubes are moved along the table and pegs are handled."""
+
+    _reversed = False
+    """The peg was grasped half a turn about the tool's approach axis from its own frame."""
 
     def push(self, cube: Thing, goal: Thing) -> None:
         """Push a cube to a goal with closed fingers, then open them."""
@@ -51,7 +55,7 @@ class PegPrimitives(RobotControl):
             side = 1 if cube.position[1] > goal.position[1] else -1
         way, z = _direction(cube, goal), cube.position[2]
         lateral = side * np.array([-way[1], way[0]])
-        q, aside = pointing_down(lateral), HOOK_ASIDE * lateral
+        q, aside = pointing_down(-lateral if self._reversed else lateral), HOOK_ASIDE * lateral
         start = self.at([*(cube.position[:2] - HOOK_BACK * way - aside), z], q)
         self.move_to(start, CLOSE)
         self.move_to(start)
@@ -70,6 +74,9 @@ class PegPrimitives(RobotControl):
         """
         self.open()
         grasp = _peg_grasp(getattr(peg, end) if isinstance(end, str) else end, flip)
+        self._reversed = bool(self.env.tier) and _looks_back(grasp)
+        if self._reversed:
+            grasp = sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi))
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), OPEN)
         self.move_to(grasp, CLOSE)
         self.close()
@@ -101,7 +108,7 @@ class PegPrimitives(RobotControl):
                 inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
                 # ... and only in this case is that compensated.
                 along += grip.p[0] if head_first and along < 0 else 0.0
-            return inserted * sapien.Pose([along, 0, -raised])
+            return inserted * sapien.Pose([-along if self._reversed else along, 0, -raised])
 
         self.move_to(station(outward * INSERT_START, INSERT_RAISED), CLOSE)
         self.move_to(station(outward * INSERT_START), CLOSE)
@@ -159,6 +166,12 @@ def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
     q = turned(end.pose.q, "x", np.pi)
     along = end.pose.to_transformation_matrix()[:3, 0]
     return sapien.Pose(end.position + outward * along, turned(q, "z", np.pi) if flip else q)
+
+
+def _looks_back(grasp: sapien.Pose) -> bool:
+    """Whether the gripper's x axis points towards the robot's base; RoboMME-OOD then turns the grasp by half a turn."""
+    forward = grasp.to_transformation_matrix()[:2, 0]
+    return bool(forward @ (grasp.p[:2] - np.array(ROBOT_BASE[:2])) < 0)
 
 
 def _direction(cube: Thing, goal: Thing) -> np.ndarray:

@@ -1,15 +1,20 @@
-"""Forward and inverse kinematics of the arm.
+"""Forward and inverse kinematics of the arm by Pinocchio, in double precision.
 
+The simulator's own kinematic model rounds poses to single precision, which screw plans and then contacts amplify.
 Poses are in the world unless named otherwise; the model itself works in the base frame. Radians and metres.
 """
 
+from functools import cache
 from typing import Any
 
 import numpy as np
+import pinocchio
 import sapien
+from transforms3d.quaternions import quat2mat
 
 from mme_vla.embodiment.robomme import ARM_JOINTS
 
+TCP, WRIST = "panda_hand_tcp", "panda_link7"
 LIMIT_TOLERANCE = 1e-3
 """Tolerance of the joint limits, radians (metres for the fingers)."""
 IK_TOLERANCE = 1e-3
@@ -18,21 +23,33 @@ _RESTARTS = 19
 _STEP, _DAMPING, _CONVERGED, _ITERATIONS = 0.1, 1e-12, 1e-5, 1000
 
 
+@cache
+def _model(urdf: str) -> Any:
+    return pinocchio.buildModelFromUrdf(urdf)
+
+
+def matrix_of(pose: sapien.Pose) -> np.ndarray:
+    """A pose as a homogeneous matrix [4, 4] in double precision."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = quat2mat(np.asarray(pose.q, np.float64))
+    matrix[:3, 3] = np.asarray(pose.p, np.float64)
+    return matrix
+
+
 class Arm:
     """The kinematic model of a ManiSkill Panda, with gripper or with stick.
 
     Joint vectors may be [7] (the arm) or longer (arm, then fingers, which do not move the tool centre point).
 
     Args:
-        agent: a ManiSkill agent on the CPU simulator whose `tcp` is the tool centre point's link.
+        agent: a ManiSkill agent on the CPU simulator whose tool centre point's link is `TCP`.
     """
 
     def __init__(self, agent: Any) -> None:
         articulation = agent.robot._objs[0]
-        self._model = articulation.create_pinocchio_model()
-        self._tcp = articulation.links.index(agent.tcp._objs[0])
-        self._wrist = next(i for i, link in enumerate(articulation.links) if link.name.endswith("panda_link7"))
-        self._dof = int(articulation.dof)
+        self._model = _model(str(agent.urdf_path))
+        self._data = self._model.createData()
+        self._tcp, self._wrist = (self._model.getFrameId(name) for name in (TCP, WRIST))
         self.base = sapien.Pose(articulation.root_pose.p, articulation.root_pose.q)
         """The base's pose in the world."""
         limits = np.asarray(articulation.qlimits, np.float64)[:ARM_JOINTS]
@@ -45,17 +62,21 @@ class Arm:
 
     def forward_in_base(self, qpos: np.ndarray) -> sapien.Pose:
         """Pose of the tool centre point in the frame of the robot's base."""
-        self._model.compute_forward_kinematics(self._padded(qpos))
-        return self._model.get_link_pose(self._tcp)
+        return sapien.Pose(self.transform(qpos))
 
-    def wrist_in_base(self) -> sapien.Pose:
-        """Pose of the hand's mounting, in the base frame, at the joints of the last `forward_in_base`."""
-        return self._model.get_link_pose(self._wrist)
+    def transform(self, qpos: np.ndarray) -> np.ndarray:
+        """The same as a homogeneous matrix [4, 4] in double precision."""
+        return np.array(self._place(self._padded(qpos), self._tcp).homogeneous)
+
+    def heights(self, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places [3] of the tool centre point and of the hand's mounting, in the base frame."""
+        tool = np.array(self._place(self._padded(qpos), self._tcp).translation)
+        return tool, np.array(pinocchio.updateFramePlacement(self._model, self._data, self._wrist).translation)
 
     def jacobian(self, qpos: np.ndarray) -> np.ndarray:
         """Spatial Jacobian [6, 7] in the base frame: linear velocity of the point at its origin, then angular."""
-        self._model.compute_full_jacobian(self._padded(qpos))
-        return np.asarray(self._model.get_link_jacobian(self._tcp, False))[:, :ARM_JOINTS]
+        full, frame = self._padded(qpos), pinocchio.ReferenceFrame.WORLD
+        return np.array(pinocchio.computeFrameJacobian(self._model, self._data, full, self._tcp, frame))[:, :ARM_JOINTS]
 
     def within_limits(self, qpos: np.ndarray) -> bool:
         """Whether every arm joint is inside its limits, up to `LIMIT_TOLERANCE`."""
@@ -75,28 +96,37 @@ class Arm:
         Returns:
             The first solution [7] within the limits and `IK_TOLERANCE`, or None.
         """
-        target = self.base.inv() * pose
+        target = np.linalg.inv(matrix_of(self.base)) @ matrix_of(pose)
         start = self._padded(qpos)
         random = np.random.default_rng(0)
         for _ in range(1 + _RESTARTS):
-            result, _, _ = self._model.compute_inverse_kinematics(
-                self._tcp,
-                target,
-                start,
-                np.arange(self._dof) < ARM_JOINTS,
-                _CONVERGED,
-                _ITERATIONS,
-                _STEP,
-                _DAMPING,
-            )
-            arm = self._wrapped(np.asarray(result)[:ARM_JOINTS])
-            if self.within_limits(arm) and pose_distance(self.forward_in_base(arm), target) < IK_TOLERANCE:
+            arm = self._wrapped(self._iterate(target, start))
+            found = sapien.Pose(self.transform(arm))
+            if self.within_limits(arm) and pose_distance(found, sapien.Pose(target)) < IK_TOLERANCE:
                 return arm
             start = self._padded(random.uniform(self.lower, self.upper))
         return None
 
+    def _iterate(self, target: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """Follow the displacement to a target [4, 4] from joints; the joints [7] where that ended."""
+        goal, joints = pinocchio.SE3(target), start.copy()
+        damping, frame = _DAMPING * np.eye(6), pinocchio.ReferenceFrame.LOCAL
+        for _ in range(_ITERATIONS):
+            error = pinocchio.log6(goal.actInv(self._place(joints, self._tcp))).vector
+            if np.linalg.norm(error) < _CONVERGED:
+                break
+            full = pinocchio.computeFrameJacobian(self._model, self._data, joints, self._tcp, frame)
+            jacobian = full[:, :ARM_JOINTS]
+            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping, error)
+            joints[:ARM_JOINTS] -= _STEP * step
+        return joints[:ARM_JOINTS].copy()
+
+    def _place(self, joints: np.ndarray, frame: int) -> Any:
+        pinocchio.forwardKinematics(self._model, self._data, joints)
+        return pinocchio.updateFramePlacement(self._model, self._data, frame)
+
     def _padded(self, qpos: np.ndarray) -> np.ndarray:
-        full = np.zeros(self._dof)
+        full = np.zeros(self._model.nq)
         full[:ARM_JOINTS] = np.asarray(qpos, np.float64)[:ARM_JOINTS]
         return full
 

@@ -5,14 +5,16 @@ joint below a velocity and an acceleration limit, so the number of steps follows
 """
 
 import logging
+from typing import Any
 
 import numpy as np
 import sapien
 import toppra
+from ompl import base, geometric, util
 from toppra import algorithm, constraint
 
 from mme_vla.embodiment.robomme import ARM_JOINTS
-from mme_vla.envs.robot.kinematics import Arm
+from mme_vla.envs.robot.kinematics import Arm, matrix_of
 
 CONTROL_STEP = 0.05
 """Seconds between two rows of a plan: the control period."""
@@ -51,9 +53,8 @@ def plan_screw(
         stalls at a singularity, or the displacement turns the tool by half a turn.
     """
     joints = np.asarray(qpos, np.float64)[:ARM_JOINTS].copy()
-    displacement = (arm.base.inv() * target_pose).to_transformation_matrix().astype(np.float64) @ np.linalg.inv(
-        arm.forward_in_base(joints).to_transformation_matrix().astype(np.float64)
-    )
+    goal = np.linalg.inv(matrix_of(arm.base)) @ matrix_of(target_pose)
+    displacement = goal @ np.linalg.inv(arm.transform(joints))
     remaining = twist_of(displacement)
     if remaining is None:
         return None
@@ -152,7 +153,7 @@ REACH = 0.5
 """Longest edge that the tree grows, radians."""
 GOAL_BIAS = 0.2
 ROUNDS = 1500
-"""Samples in one attempt; a number, not a time, so that the same seed gives the same path."""
+"""Iterations of the sampler; a number, not a time, so that the same seed gives the same path on any load."""
 WRIST_CLEARANCE = 0.03
 COLUMN_RADIUS, COLUMN_HEIGHT = 0.15, 0.45
 """The robot's base and shoulder as a cylinder that the hand keeps out of, metres."""
@@ -166,14 +167,14 @@ class Obstacles:
 
     def __init__(self, arm: Arm, ends: list[np.ndarray]) -> None:
         self._arm = arm
-        self._floor = min([0.0, *(arm.forward_in_base(end).p[2] + arm.base.p[2] for end in ends)]) - 1e-3
+        self._floor = min([0.0, *(arm.heights(end)[0][2] + arm.base.p[2] for end in ends)]) - 1e-3
 
     def clear(self, joints: np.ndarray) -> bool:
         """Whether one configuration [7] is free."""
-        tool, wrist = self._arm.forward_in_base(joints), self._arm.wrist_in_base()
+        tool, wrist = self._arm.heights(joints)
         height = self._arm.base.p[2]
-        in_column = any(np.linalg.norm(p[:2]) < COLUMN_RADIUS and p[2] < COLUMN_HEIGHT for p in (tool.p, wrist.p))
-        return bool(tool.p[2] + height >= self._floor and wrist.p[2] + height >= WRIST_CLEARANCE) and not in_column
+        in_column = any(np.linalg.norm(p[:2]) < COLUMN_RADIUS and p[2] < COLUMN_HEIGHT for p in (tool, wrist))
+        return bool(tool[2] + height >= self._floor and wrist[2] + height >= WRIST_CLEARANCE) and not in_column
 
     def clear_between(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Whether the straight joint path between two configurations is free, the first one not examined."""
@@ -182,27 +183,51 @@ class Obstacles:
 
 
 def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.ndarray | None:
-    """Joint waypoints [k, 7] from start to goal: the straight line if it is free, else what RRT* finds.
-
-    Karaman and Frazzoli 2011: each node of a random tree is connected to the cheapest free neighbour, and
-    reconnected where a newer node offers a shorter way.
+    """Joint waypoints [k, 7] from start to goal: the straight line if it is free, else what OMPL's RRT* finds.
 
     Args:
         start, goal: joint angles [7]. seed: of the samples.
 
     Returns:
-        The path, or None after `ROUNDS` samples.
+        The path, or None after `ROUNDS` iterations.
     """
     obstacles = Obstacles(arm, [start, goal])
     if obstacles.clear_between(start, goal):
         return np.array([start, goal])
-    random = np.random.default_rng(seed)
-    tree = _Tree(start, obstacles)
-    for _ in range(ROUNDS):
-        sample = goal if random.random() < GOAL_BIAS else random.uniform(arm.lower, arm.upper)
-        tree.grow(sample)
-    path = tree.path_to(goal)
-    return None if path is None else np.array(_shortened(path, obstacles))
+    util.setLogLevel(util.LOG_NONE)
+    util.RNG.setSeed(seed + 1)  # zero means the time of day
+    space = base.RealVectorStateSpace(ARM_JOINTS)
+    bounds = base.RealVectorBounds(ARM_JOINTS)
+    for joint, (low, high) in enumerate(zip(arm.lower, arm.upper, strict=True)):
+        bounds.setLow(joint, min(low, start[joint], goal[joint]))
+        bounds.setHigh(joint, max(high, start[joint], goal[joint]))
+    space.setBounds(bounds)
+    setup = geometric.SimpleSetup(space)
+    setup.setStateValidityChecker(lambda state: obstacles.clear(_joints(state)))
+    information = setup.getSpaceInformation()
+    information.setStateValidityCheckingResolution(RESOLUTION / space.getMaximumExtent())
+    setup.setStartAndGoalStates(_state(space, start), _state(space, goal))
+    planner = geometric.RRTstar(information)
+    planner.setRange(REACH)
+    planner.setGoalBias(GOAL_BIAS)
+    setup.setPlanner(planner)
+    rounds = iter(range(ROUNDS))
+    setup.solve(base.PlannerTerminationCondition(lambda: next(rounds, None) is None))
+    if not setup.haveExactSolutionPath():
+        return None
+    path = [start, *(_joints(state) for state in setup.getSolutionPath().getStates()[1:-1]), goal]
+    return np.array(_shortened(path, obstacles))
+
+
+def _joints(state: Any) -> np.ndarray:
+    return np.array([state[joint] for joint in range(ARM_JOINTS)])
+
+
+def _state(space: Any, joints: np.ndarray) -> Any:
+    state = space.allocState()
+    for joint, angle in enumerate(joints):
+        state[joint] = float(angle)
+    return state
 
 
 def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]:
@@ -215,60 +240,3 @@ def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]
         points += [path[i] + (path[j] - path[i]) * k / steps for k in range(1, steps)] + [path[j]]
         i = j
     return points
-
-
-class _Tree:
-    def __init__(self, root: np.ndarray, obstacles: Obstacles) -> None:
-        self.nodes, self.parents, self.costs = [root], [-1], [0.0]
-        self._obstacles = obstacles
-
-    def grow(self, sample: np.ndarray) -> None:
-        """Add a node on the way from the nearest one to the sample, if that way is free."""
-        distances = self._distances(sample)
-        nearest = int(np.argmin(distances))
-        if distances[nearest] == 0:
-            return
-        way = sample - self.nodes[nearest]
-        node = self.nodes[nearest] + way * min(1.0, REACH / distances[nearest])
-        if not self._obstacles.clear_between(self.nodes[nearest], node):
-            return
-        near = [i for i in np.flatnonzero(self._distances(node) <= REACH) if i != nearest]
-        parent, cost = nearest, self._cost_via(nearest, node)
-        for i in near:
-            if self._cost_via(i, node) < cost and self._obstacles.clear_between(self.nodes[i], node):
-                parent, cost = int(i), self._cost_via(i, node)
-        self.nodes.append(node)
-        self.parents.append(parent)
-        self.costs.append(cost)
-        self._rewire(near)
-
-    def path_to(self, goal: np.ndarray) -> list[np.ndarray] | None:
-        """The way from the root to a node that is the goal."""
-        distances = self._distances(goal)
-        node = int(np.argmin(distances))
-        if distances[node] > 1e-9:
-            return None
-        path = []
-        while node >= 0:
-            path.append(self.nodes[node])
-            node = self.parents[node]
-        return path[::-1]
-
-    def _rewire(self, near: list[int]) -> None:
-        new = len(self.nodes) - 1
-        for i in near:
-            cost = self._cost_via(new, self.nodes[i])
-            if cost < self.costs[i] and self._obstacles.clear_between(self.nodes[new], self.nodes[i]):
-                self._lower(i, self.costs[i] - cost)
-                self.parents[i] = new
-
-    def _lower(self, node: int, gain: float) -> None:
-        self.costs[node] -= gain
-        for child in [i for i, parent in enumerate(self.parents) if parent == node]:
-            self._lower(child, gain)
-
-    def _cost_via(self, parent: int, node: np.ndarray) -> float:
-        return self.costs[parent] + float(np.linalg.norm(node - self.nodes[parent]))
-
-    def _distances(self, sample: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(np.array(self.nodes) - sample, axis=1)

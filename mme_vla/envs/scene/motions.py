@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from mme_vla.envs.scene.stage import Stage
 
 
+type Place = Sequence[float] | np.ndarray
+
+PARKED_ROW = 16
 UNCOVERED_STEPS = 32
 """The first half of the covering window: containers are away and the cubes lie open."""
 COVER_STEPS = 64
@@ -29,17 +32,22 @@ def smoothstep(x: float) -> float:
     return x * x * (3 - 2 * x)
 
 
+def parked(group: int, i: int) -> Place:
+    """A place of its own for object `i` of a group, out of the scene: many at one place press against each other."""
+    return 20 + 0.5 * (i % PARKED_ROW), 20 + 0.5 * (4 * group + i // PARKED_ROW), 10.0
+
+
 class Appear:
     """An object is away for a number of steps, then appears at its place."""
 
-    def __init__(self, thing: Thing, until: int) -> None:
-        self.thing, self.until = thing, until
+    def __init__(self, thing: Thing, until: int, away: Place = AWAY) -> None:
+        self.thing, self.until, self.away = thing, until, away
         self.home = thing.pose
 
     def apply(self, k: int) -> None:
         """Move the object for the step before which `k` steps were done."""
         if k < self.until:
-            self.thing.move_to(sapien.Pose(AWAY, self.home.q))
+            self.thing.move_to(sapien.Pose(self.away, self.home.q))
         elif k == self.until:
             self.thing.move_to(self.home)
 
@@ -47,8 +55,12 @@ class Appear:
 class Cover:
     """Containers are away for half of a window and then stand over what lay open."""
 
-    def __init__(self, containers: Sequence[Thing]) -> None:
-        self._parts = [Appear(container, UNCOVERED_STEPS) for container in containers]
+    def __init__(self, containers: Sequence[Thing], group: int | None = None) -> None:
+        """`group`: park each container at a place of its own (`parked`); None: all at one."""
+        self._parts = [
+            Appear(container, UNCOVERED_STEPS, AWAY if group is None else parked(group, i))
+            for i, container in enumerate(containers)
+        ]
 
     def apply(self, k: int) -> None:
         """Move the containers for the step before which `k` steps were done."""
@@ -62,21 +74,28 @@ class Swap:
     Args:
         initiator: one of the two; the other is `partner`, by default the nearest one when the swap begins.
         group: every object that takes part or is to be kept in its place.
-        start: step at which it begins; it takes `SWAP_STEPS`.
+        start: step at which it begins.
         lane: how far the two evade each other sideways, metres.
+        steps: how long it takes.
     """
 
     def __init__(
-        self, initiator: Thing, group: Sequence[Thing], start: int, lane: float = 0.07, partner: Thing | None = None
+        self,
+        initiator: Thing,
+        group: Sequence[Thing],
+        start: int,
+        lane: float = 0.07,
+        partner: Thing | None = None,
+        steps: int = SWAP_STEPS,
     ) -> None:
-        self.initiator, self.partner, self.start, self.lane = initiator, partner, start, lane
+        self.initiator, self.partner, self.start, self.lane, self.steps = initiator, partner, start, lane, steps
         self._group = list(group)
         self._poses: dict[Thing, sapien.Pose] = {}
 
     @property
     def end(self) -> int:
         """The step at which the two have changed places."""
-        return self.start + SWAP_STEPS
+        return self.start + self.steps
 
     def apply(self, k: int) -> None:
         """Move the objects for the step before which `k` steps were done."""
@@ -86,10 +105,10 @@ class Swap:
             self._begin()
         assert self.partner is not None
         a, b = self._poses[self.initiator], self._poses[self.partner]
-        alpha = smoothstep((k - self.start) / SWAP_STEPS)
+        alpha = smoothstep((k - self.start) / self.steps)
         way = b.p[:2] - a.p[:2]
         aside = np.array([-way[1], way[0]]) / max(float(np.linalg.norm(way)), 1e-9)
-        arc = way * alpha + aside * self.lane * math.sin(math.pi * (k - self.start) / SWAP_STEPS)
+        arc = way * alpha + aside * self.lane * math.sin(math.pi * (k - self.start) / self.steps)
         if k == self.end:
             arc = way
         for thing, pose in self._poses.items():
@@ -119,18 +138,27 @@ def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
     return mixed / np.linalg.norm(mixed)
 
 
+def planned_swaps(
+    pairs: Sequence[Sequence[int]], group: Sequence[Thing], start: int, steps: int = SWAP_STEPS
+) -> list[Swap]:
+    """One swap after another, the first at step `start`; both objects of each are given by their indices."""
+    return [Swap(group[a], group, start + i * steps, partner=group[b], steps=steps) for i, (a, b) in enumerate(pairs)]
+
+
 class Hide:
     """Hidden objects are away during a window; at its end each lies under its container again."""
 
-    def __init__(self, hidden: Sequence[tuple[Thing, Thing]], start: int, end: int) -> None:
+    def __init__(self, hidden: Sequence[tuple[Thing, Thing]], start: int, end: int, group: int | None = None) -> None:
+        """`group`: park each object at a place of its own (`parked`); None: all at one."""
         self._hidden, self._start, self._end = list(hidden), start, end
         self._homes = [thing.pose for thing, _ in self._hidden]
+        self._away = [AWAY if group is None else parked(group, i) for i in range(len(self._hidden))]
 
     def apply(self, k: int) -> None:
         """Move the hidden objects for the step before which `k` steps were done."""
-        for (thing, container), home in zip(self._hidden, self._homes, strict=True):
+        for (thing, container), home, away in zip(self._hidden, self._homes, self._away, strict=True):
             if self._start <= k < self._end:
-                thing.move_to(sapien.Pose(AWAY, home.q))
+                thing.move_to(sapien.Pose(away, home.q))
             elif k == self._end:
                 thing.move_to(sapien.Pose([*container.position[:2], home.p[2]], home.q))
 
@@ -205,8 +233,6 @@ class Trace:
         place = (x, y, self.HEIGHT) if z < self.BELOW else BELOW_TABLE
         self._dots[k % self.STEPS].move_to(sapien.Pose(place))
 
-
-type Place = Sequence[float] | np.ndarray
 
 CUE_RADIUS, CUE_HALF_LENGTH = 0.06, 0.001
 CUE_HEIGHT = 0.0015  # metres above the table: above it, and below what lies on it

@@ -119,8 +119,12 @@ COLOURS: dict[str, RGB] = {
     "red": (1.0, 0.0, 0.0),
     "green": (0.0, 1.0, 0.0),
     "blue": (0.0, 0.0, 1.0),
+    "yellow": (1.0, 1.0, 0.0),
+    "cyan": (0.0, 1.0, 1.0),
+    "magenta": (1.0, 0.0, 1.0),
+    "orange": (1.0, 0.5, 0.0),
 }
-"""Colours of cubes."""
+"""Colours of cubes; all but the first three are those of cubes that are in the way."""
 TARGET_COLOURS: dict[str, RGB] = {
     "purple": (160 / 255, 32 / 255, 240 / 255),
     "gray": (128 / 255, 128 / 255, 128 / 255),
@@ -133,6 +137,7 @@ BROWN: RGB = (0.8, 0.6, 0.4)
 CONTAINER_Z = 0.052
 """Height of a container's origin, the middle of its handle, when it stands on the table."""
 CONTAINER_INNER, CONTAINER_WALL, CONTAINER_HEIGHT, CONTAINER_LID = 2.5 * H, 0.005, 0.05, 0.004
+CONTAINER_OUTER = CONTAINER_INNER + 2 * CONTAINER_WALL
 BOARD_SIDE, BOARD_HOLE, BOARD_HEIGHT = 0.1, 0.08, 0.05
 APERTURE_Z = 0.04
 """Height of the middle of the box with an aperture."""

@@ -6,7 +6,6 @@ free place: an obstacle is the shadow of the first two axes of its bounding box,
 the gap depends on what is placed.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -228,7 +227,7 @@ def draw_disc(
 
 
 def draw_container(
-    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005
+    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005, degrees: bool = False
 ) -> tuple[np.ndarray, float] | None:
     """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts twice.
 
@@ -236,15 +235,17 @@ def draw_container(
         region: the container lies inside it.
         avoid: what it keeps clear of.
         gap: metres.
+        degrees: give the yaw in degrees, as rows do.
 
     Returns:
-        Centre [2] and yaw in radians; None when 256 trials have failed.
+        Centre [2] and yaw, in radians by default; None when 256 trials have failed.
     """
     obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=gap)
     for _ in range(TRIALS):
         xy = region.place(draws, CONTAINER_HALF)
         if all(obstacle.distance(xy) >= CONTAINER_HALF + gap for obstacle in obstacles):
-            return xy, float(np.deg2rad(90 * draws.uniform()))
+            yaw = 90 * draws.uniform()
+            return xy, yaw if degrees else float(np.deg2rad(yaw))
     return None
 
 
@@ -283,13 +284,13 @@ SHIFT = 0.1
 def rotated_anchors(draws: Draws, count: int) -> list[Point]:
     """Three anchors in a triangle or on a line, or four in a square, rotated about the table's middle."""
     on_line = draws.integer(0, 2)  # sampled for four anchors, too
-    angle = draws.uniform() * ANGLE_RANGE
+    angle = draws.uniforms(1) * ANGLE_RANGE
     triangle = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]
     line = [(0.0, -0.15), (0.0, 0.15), (0.0, 0.0)]
     square = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.1), (0.1, -0.1)]
     anchors = square if count == len(square) else line if on_line else triangle
-    cos, sin = math.cos(angle), math.sin(angle)
-    return [(cos * x - sin * y, sin * x + cos * y) for x, y in anchors]
+    cos, sin = angle.cos(), angle.sin()  # in single precision, as the benchmark has it
+    return [((cos * x - sin * y).item(), (sin * x + cos * y).item()) for x, y in anchors]
 
 
 def shifted_anchors(draws: Draws, count: int) -> list[Point]:

@@ -25,6 +25,8 @@ class Stage(BaseEnv):
     """A robot at a table under two cameras; `Task` adds the objects and the script."""
 
     SUPPORTED_REWARD_MODES = ("none", "dense")
+    tier: str = ""
+    """Of RoboMME-OOD, whose rules then hold; empty for the benchmark's."""
     stick: ClassVar[bool] = False
     """The robot holds a stick instead of a gripper."""
     spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))

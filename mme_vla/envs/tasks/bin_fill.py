@@ -2,20 +2,21 @@
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from itertools import islice
+from typing import Any
 
 import sapien
 
-from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Appear, Cue, row, tally
 from mme_vla.envs.scene.objects import Cube, H, build_board, build_cube
-from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube
 from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import press
+from mme_vla.envs.tasks.families.stages import add_button, press
 
 # Both bounds belong to the range.
 AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
@@ -23,6 +24,8 @@ GOAL_COLOURS = {"easy": (1, 1), "medium": (1, 2), "hard": (2, 3)}
 GOAL_CUBES = {"easy": (1, 3), "medium": (2, 4), "hard": (3, 5)}
 CUBES = {"easy": (4, 6), "medium": (8, 10), "hard": (10, 12)}
 COLOURS = ("red", "blue", "green")
+ORDERED = ("blue", "red", "green")  # from which the order of the sub-tasks is sampled
+BOARD_X = 0.15  # metres
 TABLE = Region((-0.1, 0.0), (0.2, 0.25))
 APPEAR_EVERY = 50
 IN_BIN = sapien.Pose((10.0, 10.0, 0.0))
@@ -38,40 +41,78 @@ class BinFill(Task):
     recovery_sampled_per_episode = True
 
     def build(self, draws: Draws) -> None:
-        self.streaming = draws.integer(0, 2) == 0
-        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
-        x, y = -0.05 + 0.2 * draws.uniform(), -0.2 + 0.4 * draws.uniform()
-        self.board = self.add(build_board(self, (x, y), math.radians(-20 + 40 * draws.uniform())))
-        self._draw_counts(draws)
-        colours = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
+        values = self.values
+        self.streaming = values.flag("actions.streaming", lambda: draws.integer(0, 2) == 0, default=False)
+        self.button = add_button(self, draws, (-0.2, 0))
+        dx, y, degrees = values.place(
+            "layout.board_offsets",
+            lambda: [0.2 * draws.uniform() - 0.2, -0.2 + 0.4 * draws.uniform(), -20 + 40 * draws.uniform()],
+            size=3,
+        )
+        self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
+        numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
+        whole = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
+        if not whole or len(numbers) != len(COLOURS) or not any(numbers):
+            raise values.error("objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green")
+        self.goal = Counter(dict(zip(COLOURS, numbers, strict=True)))
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
+        for colour, (x, y, yaw) in self._given_cubes() if values.given else self._draw_cubes(draws):
+            cubes = self.cubes[colour]
+            values.occupy("layout.slots", (x, y), H, yaw)
+            cubes.append(self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, (x, y), yaw)))
+        for colour in COLOURS:
+            if len(self.cubes[colour]) < self.goal[colour]:
+                problem = f"a {colour} cube for the bin"
+                raise (
+                    values.error("objects.slot_assignment", f"lacks {problem}")
+                    if values.given
+                    else SceneError(f"BinFill, seed {self.seed}: {problem} finds no place.")
+                )
+
+    def _given_cubes(self) -> Iterator[tuple[str, list[float]]]:
+        """Colour and place of each cube of the row."""
+        names: Any = self.values("objects.slot_assignment", list)
+        count = self.values.count("layout.slots")
+        if not isinstance(names, list) or len(names) != count:
+            raise self.values.error("objects.slot_assignment", f"must name a cube for each of the {count} slots")
+        for i, name in enumerate(names):
+            colour = str(name).split("_")[0]
+            if colour not in COLOURS:
+                raise self.values.error(f"objects.slot_assignment.{i}", f"is {name!r}; expected {', '.join(COLOURS)}")
+            yield colour, self.values.place(f"layout.slots.{i}", list, size=3)
+
+    def _draw_cubes(self, draws: Draws) -> Iterator[tuple[str, list[float]]]:
+        """Likewise from random numbers; a cube that finds no place is left out."""
+        colours = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
+        count = 0
         for i in draws.permutation(len(colours)):
             colour = colours[i]
             place = draw_cube(draws, TABLE, [self.button, self.board, *self.all_cubes()], gap=H)
             if place is not None:
-                cubes = self.cubes[colour]
-                cubes.append(self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, *place)))
-        for colour in COLOURS:
-            if len(self.cubes[colour]) < self.goal[colour]:
-                raise SceneError(f"BinFill, seed {self.seed}: a {colour} cube for the bin finds no place.")
+                self.values.note(f"layout.slots.{count}", [*place[0], place[1]])
+                self.values.note(f"objects.slot_assignment.{count}", f"{colour}_{len(self.cubes[colour])}")
+                count += 1
+                yield colour, [*place[0], place[1]]
 
-    def _draw_counts(self, draws: Draws) -> None:
-        """How many cubes of each colour belong into the bin, and how many lie on the table."""
+    def _draw_counts(self, draws: Draws) -> list[int]:
+        """How many red, blue and green cubes belong into the bin; also samples how many lie on the table."""
         available = [COLOURS[i] for i in draws.permutation(3)][: AVAILABLE[self.difficulty]]
         low, high = GOAL_COLOURS[self.difficulty]
         selected = available[: draws.integer(low, high + 1)]
         low, high = GOAL_CUBES[self.difficulty]
         total = draws.integer(low, high + 1)
         picks = [0] * total if len(selected) == 1 else [draws.integer(0, len(selected)) for _ in range(total)]
-        self.goal = Counter(selected[i] for i in picks)
+        goal = Counter(selected[i] for i in picks)
         low, high = CUBES[self.difficulty]
         cubes = draws.integer(low, high + 1)
-        self.spawned = Counter({colour: max(1, self.goal[colour]) for colour in available})
+        self.spawned = Counter({colour: max(1, goal[colour]) for colour in available})
         for _ in range(cubes - self.spawned.total()):
             self.spawned[available[draws.integer(0, len(available)) if len(available) > 1 else 0]] += 1
+        return [goal[colour] for colour in COLOURS]
 
     def start_episode(self, draws: Draws) -> None:
-        self.order = [("blue", "red", "green")[i] for i in draws.permutation(3)]
+        order = self.values.indices("initializations.color_order", lambda: draws.permutation(3), len(ORDERED))
+        self.order = [ORDERED[i] for i in order]
         self.filled: Counter[str] = Counter()
         self._streams = [
             Appear(cube, APPEAR_EVERY * i)

@@ -1,7 +1,7 @@
 """ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up the right one."""
 
-from mme_vla.envs.scene.articulated import Button, build_button
-from mme_vla.envs.scene.placement import Draws, draw_button, shifted_anchors
+from mme_vla.envs.scene.articulated import Button
+from mme_vla.envs.scene.placement import Draws, shifted_anchors
 from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
@@ -12,8 +12,10 @@ from mme_vla.envs.tasks.families.containers import (
     container_picks,
     hiding_goal,
 )
+from mme_vla.envs.tasks.families.stages import add_button
 
 LETTERS = ("c", "d")
+WAIT_TEXT, WAIT_LETTER = "wait for the containers to finish swapping", "e"  # in rows of RoboMME-OOD
 
 
 @register_task
@@ -22,8 +24,8 @@ class ButtonUnmaskSwap(UnmaskSwap):
 
     def build(self, draws: Draws) -> None:
         self.left, self.right = (
-            self.add(build_button(self, draw_button(draws, (-0.2, y), (0.05, 0.05)), name))
-            for name, y in (("button_left", -0.1), ("button_right", 0.1))
+            add_button(self, draws, (-0.2, y), (0.05, 0.05), name, f"layout.buttons_xy.{i}")
+            for i, (name, y) in enumerate((("button_left", -0.1), ("button_right", 0.1)))
         )
         self.build_containers(draws, shifted_anchors(draws, CONTAINERS[self.difficulty]), [self.left, self.right])
 
@@ -33,7 +35,16 @@ class ButtonUnmaskSwap(UnmaskSwap):
 
     def subtasks(self) -> list[SubTask]:
         presses = [self._press("first", self.right, "a"), self._press("second", self.left, "b")]
-        return [*presses, *container_picks(self, self.targets, self.containers, LETTERS)]
+        watch = [self._watch()] if self.tier else []
+        return [*presses, *watch, *container_picks(self, self.targets, self.all_containers, LETTERS)]
+
+    def _watch(self) -> SubTask:
+        return SubTask(
+            WAIT_TEXT,
+            done=lambda: self.steps_done >= self.swapped_after,
+            run=lambda demo: demo.hold_until(self.swapped_after),
+            choice=WAIT_LETTER,
+        )
 
     def _press(self, which: str, button: Button, choice: str) -> SubTask:
         """Press the button that is shown, or the other one if it has not been pressed yet."""
@@ -57,6 +68,7 @@ class ButtonUnmaskSwap(UnmaskSwap):
             Choice("a", "press the first button", lambda demo, _: demo.press(self.left)),
             Choice("b", "press the second button", lambda demo, _: demo.press(self.right)),
             *container_choices(self.containers, LETTERS),
+            *([Choice(WAIT_LETTER, "wait", lambda demo, _: demo.hold_until(self.swapped_after))] if self.tier else []),
         ]
 
     def goals(self) -> list[str]:

@@ -16,7 +16,7 @@ from mme_vla.envs.scene.motions import Cue, Highlight, Mark, build_mark, on_tabl
 from mme_vla.envs.scene.objects import APERTURE_COLOUR, APERTURE_Z, at, build_aperture_box, build_highlight
 from mme_vla.envs.scene.placement import Draws, SceneError
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up
-from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.scene.things import Thing, distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -50,31 +50,57 @@ class InsertPeg(Task):
     def build(self, draws: Draws) -> None:
         for _ in range(2):
             draws.uniform()  # part of the official stream, without effect
-        head = tuple(draws.uniforms(3).tolist())
-        tail = tuple(1 - c for c in head)
+        head = self.values.colour("objects.head_rgb", lambda: draws.uniforms(3).tolist())
+        tail = (1 - head[0], 1 - head[1], 1 - head[2])
         draws.integer(0, 3)
         self.box = self.add(build_aperture_box(self, (0, 0), math.pi / 2))
         self.pegs = [
             self.add(build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, (0.2, 0.2 * (i - 1)), 0))
-            for i in range(PEGS)
+            for i in range(self.values.count("initializations.pegs") if self.values.given else PEGS)
         ]
+        if not self.pegs:
+            raise self.values.error("initializations.pegs", "is missing or empty")
         self.peg = self.pegs[0]
         self._disc = build_highlight(self, "disc", *MARK, APERTURE_COLOUR)
         self._red_disc = build_mark(self, "disc_red", MARK[0] * 1.003, MARK[1] * 1.003)
 
     def start_episode(self, draws: Draws) -> None:
-        x, y = (-0.1 + 0.2 * draws.uniform() for _ in range(2))
-        self.box.set_home(at((x, y), APERTURE_Z, math.radians(90 - 20 + 40 * draws.uniform())))
-        places: list[tuple[float, float]] = []
-        for peg in self.pegs:
-            places.append(self._draw_place(draws, (x, y), places))
-            peg.set_home(at(places[-1], 0, math.radians(-45 + 90 * draws.uniform())))
-        self.end: PegEnd = ENDS[draws.integer(0, 2)]
-        self.side = (-1, 1)[draws.integer(0, 2)]
+        values = self.values
+        x, y = values.place("initializations.box_jitter", lambda: [-0.1 + 0.2 * draws.uniform() for _ in range(2)])
+        yaw = values.number("initializations.box_yaw", lambda: math.radians(90 - 20 + 40 * draws.uniform()))
+        self.box.set_home(at((x, y), APERTURE_Z, yaw))
+        for peg, (place, turn) in zip(self.pegs, self._read_pegs() or self._draw_pegs(draws, (x, y)), strict=True):
+            peg.set_home(at(place, 0, turn))
+        self.end: PegEnd = ENDS[values.integer("initializations.obj_sample", lambda: draws.integer(0, 2), most=1)]
+        self.side = (-1, 1)[values.integer("initializations.dir_sample", lambda: draws.integer(0, 2), most=1)]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         self.mark = Mark(self._red_disc, self.box.position, DISPLAY_STEPS)
         self._helpful, self._restoring = 0, False
+
+    def _read_pegs(self) -> list[tuple[list[float], float]]:
+        """Place and yaw of each peg of the row; empty where there is none."""
+        values = self.values
+        pegs: list[tuple[list[float], float]] = []
+        for i in range(len(self.pegs) if values.given else 0):
+            entry, name = values.find("initializations.pegs")[i], f"initializations.pegs.{i}"
+            if not isinstance(entry, list) or len(entry) != 2:
+                raise values.error(name, f"is {entry!r}; expected [[x, y], yaw]")
+            place = values.check_place(name, [*entry[0], entry[1]] if isinstance(entry[0], list) else entry, 3)
+            if any(math.dist(place[:2], other) < PEG_RADIUS for other, _ in pegs):
+                raise values.error(name, "overlaps another peg")
+            pegs.append((place[:2], place[2]))
+        return pegs
+
+    def _draw_pegs(self, draws: Draws, box: tuple[float, float]) -> list[tuple[tuple[float, float], float]]:
+        places: list[tuple[float, float]] = []
+        yaws = []
+        for _ in self.pegs:
+            places.append(self._draw_place(draws, box, places))
+            yaws.append(math.radians(-45 + 90 * draws.uniform()))
+        pegs = list(zip(places, yaws, strict=True))
+        self.values.note("initializations.pegs", pegs)
+        return pegs
 
     def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
         for _ in range(TRIES):
@@ -115,6 +141,13 @@ class InsertPeg(Task):
         nearer = np.linalg.norm(grasped.position - tcp) < np.linalg.norm(other.position - tcp)
         return bool(grasped.position[2] > LIFTED_Z and nearer)
 
+    def _is_near(self, grasped: Thing, free: Thing) -> bool:
+        """Whether the grasped end is the nearer one: along x, or in rows of RoboMME-OOD by the distance."""
+        if not self.tier:
+            return bool(grasped.position[0] < free.position[0])
+        near = [distance_xy(thing.position, np.array(ROBOT_BASE)) for thing in (grasped, free)]
+        return near[0] < near[1] or (near[0] == near[1] and self.end == "head")
+
     def _inside(self, thing: Thing) -> bool:
         return float(np.linalg.norm(thing.position - self.box.position)) <= INSERTED
 
@@ -137,7 +170,7 @@ class InsertPeg(Task):
     def _both(self, video: bool) -> list[SubTask]:
         grasped, free = self.ends(self.end)
         side = "right" if self.side == 1 else "left"
-        word = "near" if grasped.position[0] < free.position[0] else "far"  # from the robot's base
+        word = "near" if self._is_near(grasped, free) else "far"  # from the robot's base
         wrong_end = "tail" if self.end == "head" else "head"
         of_box = " of the box" if video else ""
         others = [end for peg in self.pegs[1:] for end in (peg.head, peg.tail)]

@@ -1,7 +1,7 @@
 """MoveCube (Imitation): the video moves a cube to a target in one of three manners; move it in the same manner."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sapien
@@ -13,7 +13,7 @@ from mme_vla.envs.scene.predicates import dropped_onto, gripper_open, picked_up,
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import end_video, pick, wait
+from mme_vla.envs.tasks.families.stages import delay, end_video, pick, wait
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -29,6 +29,7 @@ TARGET_RADIUS = 0.04
 CUBE_FROM_TARGET = 5 * H
 CUBE_GAP = 0.005
 TRIES = 128
+PARTS = ("demo", "execution")
 HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
 MORE_TRIES = 2  # where the cube did not stay on the target
 
@@ -43,22 +44,46 @@ class MoveCube(Task):
     def build(self, draws: Draws) -> None:
         for _ in range(2):
             draws.uniform()  # part of the official stream, without effect
-        video_peg, peg = self._draw_peg(draws), self._draw_peg(draws)
+        video_peg, peg = (self._place_peg(draws, part) for part in PARTS)
         for _ in range(2):
             draws.integer(0, 2)
-        video_goal, goal = (self._draw_goal(draws, half) for half in (0.15, 0.1))
+        video_goal = self.values.place("layout.demo.goal_xy", lambda: self._draw_goal(draws, 0.15))
+        goal = self.values.place("layout.execution.goal_xy", lambda: self._draw_goal(draws, 0.1))
         self.peg = self.add(
             build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, video_peg[:2], video_peg[2])
         )
         self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal))
-        xy, yaw = self._draw_cube(draws, video_goal, [])
+        xy, yaw = self._place_cube(draws, PARTS[0], video_goal, [])
         self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
-        xy, yaw = self._draw_cube(draws, goal, [self.cube])
+        xy, yaw = self._place_cube(draws, PARTS[1], goal, [self.cube])
         self._execution_poses = {
             self.peg: at(peg[:2], 0, peg[2]),
             self.target: sapien.Pose([*goal, self.target.position[2]], self.target.pose.q),
             self.cube: at(xy, H, yaw),
         }
+
+    def _place_peg(self, draws: Draws, part: str) -> tuple[float, float, float]:
+        """Place and yaw of the peg in the video or in the execution."""
+        if not self.values.given:
+            x, y, yaw = self._draw_peg(draws)
+            self.values.note(f"layout.{part}.peg_offsets", [0.0, x, y])
+            self.values.note(f"layout.{part}.peg_yaw", yaw)
+            return x, y, yaw
+        _, x, y = self.values.place(f"layout.{part}.peg_offsets", list, size=3)
+        return x, y, self.values.number(f"layout.{part}.peg_yaw", float)
+
+    def _place_cube(self, draws: Draws, part: str, goal: Any, avoid: list) -> tuple[tuple[float, float], float]:
+        """Place and yaw of the cube in the video or in the execution."""
+
+        def sample() -> list[float]:
+            xy, yaw = self._draw_cube(draws, goal, avoid)
+            return [*xy, yaw]
+
+        name = f"layout.{part}.cube_pose"
+        x, y, yaw = self.values.place(name, sample, size=3)
+        if self.values.given and math.dist((x, y), goal) <= H:
+            raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
+        return (x, y), yaw
 
     @staticmethod
     def _draw_peg(draws: Draws) -> tuple[float, float, float]:
@@ -71,7 +96,7 @@ class MoveCube(Task):
         assert xy is not None
         return xy
 
-    def _draw_cube(self, draws: Draws, goal: np.ndarray, avoid: list) -> tuple[np.ndarray, float]:
+    def _draw_cube(self, draws: Draws, goal: Any, avoid: list) -> tuple[np.ndarray, float]:
         """A place near a point that is not near the goal."""
         for _ in range(TRIES):
             centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
@@ -83,7 +108,7 @@ class MoveCube(Task):
         raise SceneError(f"MoveCube, seed {self.seed}: the cube finds no place away from the target.")
 
     def start_episode(self, draws: Draws) -> None:
-        self.manner = MANNERS[draws.integer(0, 3)]
+        self.manner = MANNERS[self.values.integer("initializations.way_idx", lambda: draws.integer(0, 3), most=2)]
 
     def after_step(self, k: int) -> None:
         if self.reset_in_progress:
@@ -91,7 +116,7 @@ class MoveCube(Task):
                 thing.displace(pose)
 
     def subtasks(self) -> list[SubTask]:
-        between = [wait(self, HOLD_STEPS[self.manner] + self.turned("delay")), end_video(self)]
+        between = [wait(self, HOLD_STEPS[self.manner] + delay(self)), end_video(self)]
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
         return [*moves(video=True), *between, *moves(video=False)]
 

@@ -1,5 +1,6 @@
 """PatternLock (Imitation): the video traces a path over a grid of discs with the stick; trace it again."""
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -44,7 +45,11 @@ class PatternLock(Task):
         middle = (n - 1) / 2
         places = [(CENTRE[0] + (r - middle) * SPACING, CENTRE[1] + (c - middle) * SPACING) for r, c in np.ndindex(n, n)]
         self.discs = [self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy)) for i, xy in enumerate(places)]
-        self.path = [self.discs[i] for i in self._draw_path(draws, n)]
+        nodes = self.values.indices("actions.path_nodes", lambda: self._draw_path(draws, n), n * n)
+        steps = [np.subtract(divmod(a, n), divmod(b, n)) for a, b in itertools.pairwise(nodes)]
+        if len(nodes) < 2 or any(np.abs(step).max() > 1 for step in steps):
+            raise self.values.error("actions.path_nodes", f"is {nodes}; expected a path over neighbours, {n} a row")
+        self.path = [self.discs[i] for i in nodes]
         self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(n * n)]
         self._trace = Trace(self)
 

@@ -1,19 +1,19 @@
 """PickHighlight (Reference): some cubes are briefly underlaid with white; press the button, then pick up just those."""
 
-from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, Highlight, under
-from mme_vla.envs.scene.objects import Cube, H, build_highlight
-from mme_vla.envs.scene.placement import Draws, Region, draw_button
+from mme_vla.envs.scene.objects import COLOURS, RGB, Cube, H, build_highlight
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import add_cube, pick, press
+from mme_vla.envs.tasks.families.stages import add_button, add_cube, pick, press
 
 CUBES = {"easy": 3, "medium": 4, "hard": 6}
 GOALS = {"easy": 1, "medium": 2, "hard": 3}
 HIGHLIGHTED = (10, 100)  # steps; on the episode's clock, the button does not matter
 RELEASE_Z = 0.01
+TABLE = Region((-0.1, 0), 0.2)
 
 
 @register_task
@@ -24,21 +24,30 @@ class PickHighlight(Task):
     dials = frozenset({"distractors"})
 
     def build(self, draws: Draws) -> None:
-        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
+        self.button = add_button(self, draws, (-0.2, 0))
         self.cubes: list[Cube] = []
-        for i in range(CUBES[self.difficulty]):
-            colour = ("red", "blue", "green")[draws.integer(0, 3)]
-            avoid = [self.button, *self.cubes]
-            self.cubes.append(add_cube(self, draws, f"cube_{i}", colour, Region((-0.1, 0), 0.2), avoid, gap=2 * H))
-        self.goal_cubes = [self.cubes[i] for i in draws.permutation(len(self.cubes))[: GOALS[self.difficulty]]]
+        self._add_cubes(draws, "cube", "layout.cubes", CUBES[self.difficulty])
+        count = len(self.cubes)
+        goals = self.values.indices(
+            "objects.highlight_ids", lambda: draws.permutation(count)[: GOALS[self.difficulty]], count
+        )
+        if not goals:
+            raise self.values.error("objects.highlight_ids", "is empty; expected at least one cube")
+        self.goal_cubes = [self.cubes[i] for i in goals]
         self._discs = [build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(self.goal_cubes))]
+        self._add_cubes(draws, "distractor", "layout.distractors", self.turned("distractors"))
 
-        for i in range(self.turned("distractors")):
-            colour = ("red", "blue", "green")[draws.integer(0, 3)]
+    def _add_cubes(self, draws: Draws, name: str, part: str, count: int) -> None:
+        for i in range(self.values.count(part) if self.values.given else count):
+            colour, value = self._colour(draws, len(self.cubes)), f"{part}.{i}"
             avoid = [self.button, *self.cubes]
-            self.cubes.append(
-                add_cube(self, draws, f"distractor_{i}", colour, Region((-0.1, 0), 0.2), avoid, gap=2 * H)
-            )
+            self.cubes.append(add_cube(self, draws, f"{name}_{i}", colour, TABLE, avoid, gap=2 * H, value=value))
+
+    def _colour(self, draws: Draws, i: int) -> str | RGB:
+        """A name, or in rows of RoboMME-OOD any colour."""
+        if self.values.find("objects.color_rgba") is not None:
+            return self.values.colour(f"objects.color_rgba.{i}", list)
+        return self.values.word(f"objects.colors.{i}", lambda: ("red", "blue", "green")[draws.integer(0, 3)], COLOURS)
 
     def cues(self) -> list[Cue]:
         return [under(cube) for cube in self.goal_cubes]
@@ -55,22 +64,24 @@ class PickHighlight(Task):
     def failure(self) -> bool:
         self.picked.update(cube for cube in self.goal_cubes if picked_up(self, cube))
         others = [cube for cube in self.cubes if cube not in self.goal_cubes]
+        if self.tier and self.progress.index == 0:
+            return any_picked_up(self, self.cubes)
         return self.progress.index > 0 and any_picked_up(self, others)
 
     def success(self) -> bool:
-        return len(self.picked) == len(self.goal_cubes)
+        every_one = len(self.picked) == len(self.goal_cubes)
+        return every_one and (self.progress.succeeded or not self.tier)
 
     def subtasks(self) -> list[SubTask]:
         steps = [press(self.button, "press the button", "a")]
         for i, cube in enumerate(self.goal_cubes):
-            if i:
-                steps.append(self._place(self.goal_cubes[i - 1]))
-            steps.append(self._pick(i, cube))
-        return steps
+            steps += [self._pick(i, cube), self._place(cube)]
+        return [*steps, press(self.button, "press the button", "a")] if self.tier else steps[:-1]
 
     def _pick(self, i: int, cube: Cube) -> SubTask:
-        which = "highlighted cube" if len(self.goal_cubes) == 1 else f"{ordinal(i)} highlighted cube"
-        return pick(self, cube, f"pick up the {which}, which is {cube.colour}", "b", pick=True, operation="which")
+        which = "highlighted cube" if len(self.goal_cubes) == 1 and not self.tier else f"{ordinal(i)} highlighted cube"
+        text = f"pick up the {which}" if self.tier else f"pick up the {which}, which is {cube.colour}"
+        return pick(self, cube, text, "b", pick=True, operation="which")
 
     def _place(self, cube: Cube) -> SubTask:
         return SubTask(
@@ -90,6 +101,13 @@ class PickHighlight(Task):
         ]
 
     def goals(self) -> list[str]:
+        if self.tier:
+            cubes = "every cube highlighted with a white area on the table one at a time"
+            return [
+                "first press the button, then pick up all highlighted cubes one by one, finally press the button to "
+                "stop",
+                f"first press the button, then pick up {cubes}, finally press the button again to stop",
+            ]
         return [
             # The spelling is the benchmark's.
             "first press the button, then pick up all cubes that have been highlighteted with white areas on the table",

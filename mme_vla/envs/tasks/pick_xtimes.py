@@ -1,20 +1,29 @@
 """PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
 
-from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, row, tally
-from mme_vla.envs.scene.objects import Cube, H, build_disc
-from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_disc
+from mme_vla.envs.scene.objects import Cube, H
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.predicates import any_picked_up, dropped_onto, pressed
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import add_cube, pick, press
+from mme_vla.envs.tasks.families.stages import (
+    add_button,
+    add_cube,
+    add_distractors,
+    add_target,
+    check_colour,
+    cube_names,
+    pick,
+    press,
+    sample_colours,
+)
 
 COLOURS = ("red", "blue", "green")
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 REPETITIONS = {"easy": (1, 3), "medium": (1, 3), "hard": (4, 5)}  # fewest and most
 TABLE = Region((-0.1, 0.0), 0.2)
-TARGET_RADIUS, TARGET_THICKNESS = 0.04, 0.005
+TARGET_RADIUS = 0.04
 
 
 @register_task
@@ -26,20 +35,27 @@ class PickXtimes(Task):
 
     def plan(self, draws: Draws) -> None:
         fewest, most = REPETITIONS[self.difficulty]
-        self.repetitions = draws.integer(fewest, most + 1) + self.turned("count")
+        self.repetitions = self.values.integer(
+            "objects.num_repeats", lambda: draws.integer(fewest, most + 1) + self.turned("count"), least=1
+        )
 
     def build(self, draws: Draws) -> None:
-        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0.0))))
-        colours = [COLOURS[i] for i in draws.permutation(3)][: CUBES[self.difficulty]]
+        self.button = add_button(self, draws, (-0.2, 0.0))
+        colours = sample_colours(self, draws, COLOURS)[: CUBES[self.difficulty]]
         draws.integer(0, 3)  # part of the official stream, without effect
         self.cubes: list[Cube] = []
-        for colour in colours:
-            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, [self.button, *self.cubes]))
-        xy = draw_disc(draws, TABLE, TARGET_RADIUS, [self.button, *self.cubes], gap=2 * H)
-        if xy is None:
-            raise SceneError(f"PickXtimes, seed {self.seed}: the target finds no place.")
-        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, TARGET_THICKNESS, "purple", xy))
-        self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+        for name in cube_names(self, "layout.cubes", colours):
+            colour, avoid = name.split("_")[0], [self.button, *self.cubes]
+            value = f"layout.cubes.{name}"
+            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, avoid, value=value))
+        avoid = [self.button, *self.cubes]
+        self.target = add_target(self, draws, "target", "layout.goal_xy", TABLE, TARGET_RADIUS, avoid, gap=2 * H)
+        count = len(self.cubes)
+        self.cube = self.cubes[
+            self.values.integer("objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1)
+        ]
+        check_colour(self, self.cube.colour)
+        self.distractors = add_distractors(self, draws, TABLE)
 
     def cues(self) -> list[Cue]:
         def left() -> int:
@@ -51,7 +67,7 @@ class PickXtimes(Task):
         steps = []
         for i in range(self.repetitions):
             steps += [self._pick(i), self._place()]
-        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
+        stop = {"failed": lambda: any_picked_up(self, [*self.cubes, *self.distractors]), "operation": "how many"}
         return [*steps, press(self.button, "press the button to stop", "c", **stop)]
 
     def _pick(self, i: int) -> SubTask:
@@ -71,7 +87,7 @@ class PickXtimes(Task):
         )
 
     def _strayed(self) -> bool:
-        others = [cube for cube in self.cubes if cube is not self.cube]
+        others = [cube for cube in (*self.cubes, *self.distractors) if cube is not self.cube]
         return any_picked_up(self, others) or pressed(self.button)
 
     def _mistaken(self) -> str:
@@ -80,7 +96,9 @@ class PickXtimes(Task):
 
     def choices(self) -> list[Choice]:
         return [
-            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice(
+                "a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: [*self.cubes, *self.distractors]
+            ),
             Choice("b", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)),
             Choice("c", "press the button to stop", lambda demo, _: demo.press(self.button)),
         ]

@@ -1,5 +1,6 @@
 """RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same route."""
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
@@ -28,6 +29,7 @@ HOME_STEPS = 200
 CUE_RADIUS, DOT_RADIUS = 0.04, 0.01
 DOTS = range(8, 40, 7)  # of an arc's 45 points
 Direction = Literal["clockwise", "counterclockwise"]
+TURNS = dict.fromkeys(("clockwise", "counterclockwise"))
 SIDES: tuple[tuple[str, Direction], ...] = (
     ("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"),
 )  # fmt: skip
@@ -41,7 +43,7 @@ class RouteStick(Task):
     latch_failure = True
 
     def build(self, draws: Draws) -> None:
-        angle = math.radians(-30 + 60 * draws.uniform())
+        angle = math.radians(self.values.number("layout.rotation_deg", lambda: -30 + 60 * draws.uniform()))
         rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         places = [rotation @ (CENTRE_X, (i - PLACES // 2) * SPACING) for i in range(PLACES)]
         self.all_discs = [
@@ -49,14 +51,30 @@ class RouteStick(Task):
             for i, xy in enumerate(places)
         ]
         for i in range(1, PLACES, 2):
-            red, green, blue = draws.uniforms(3).tolist()
-            self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, (red, green, blue)))
+            colour = self.values.colour(f"layout.obstacle_rgb.{i // 2}", lambda: draws.uniforms(3).tolist())
+            self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, colour))
         self.discs = self.all_discs[::2]
         self._draw_route(draws)
         self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(5)]
         self._dots = Trace(self)
 
     def _draw_route(self, draws: Draws) -> None:
+        """The row's route and turns, or random ones."""
+        values, count = self.values, len(self.discs)
+        route = values.indices("actions.route", lambda: self._sample_route(draws), count, distinct=False)
+        if len(route) < 2 or any(abs(a - b) != 1 for a, b in itertools.pairwise(route)):
+            raise values.error("actions.route", f"is {route}; expected a way from disc to neighbouring disc")
+        moves = len(route) - 1
+
+        def sample() -> list[str]:
+            return ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+
+        self.route = [self.discs[i] for i in route]
+        self.directions: list[Direction] = values.words("actions.turns", sample, TURNS)  # type: ignore[assignment]
+        if len(self.directions) != moves:
+            raise values.error("actions.turns", f"has {len(self.directions)} turns for {moves} moves")
+
+    def _sample_route(self, draws: Draws) -> list[int]:
         low, high = MOVES[self.difficulty]
         moves = draws.integer(low, high + 1)
         route = [draws.integer(0, len(self.discs))]
@@ -65,8 +83,7 @@ class RouteStick(Task):
             if self.difficulty != "hard" and len(route) > 1 and len(nearby) > 1:
                 nearby.remove(route[-2])
             route.append(nearby[draws.integer(0, len(nearby))])
-        self.route = [self.discs[i] for i in route]
-        self.directions: list[Direction] = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+        return route
 
     def cues(self) -> list[Cue]:
         """Of the next move: a disc under its target, and smaller ones along its arc."""

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, row, smoothstep, tally
 from mme_vla.envs.scene.objects import build_disc, build_moving_cube
-from mme_vla.envs.scene.placement import Draws, draw_button
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.predicates import hovering, pressed
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import add_button
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -36,28 +36,30 @@ class StopCube(Task):
     dials = frozenset({"count"})
 
     def build(self, draws: Draws) -> None:
-        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
-        xy = (draws.between(-0.1, 0.1), draws.between(-0.1, 0.1))
+        self.passes = self.values.integer("actions.motion_segments", lambda: PASSES + self.turned("count"), least=1)
+        self.button = add_button(self, draws, (-0.2, 0))
+        xy = self.values.place("layout.target_xy", lambda: [draws.between(-0.1, 0.1), draws.between(-0.1, 0.1)])
         self.target = self.add(build_disc(self, "target", 0.036, 0.01, "purple", xy))
-        red, green, blue = draws.uniforms(3).tolist()
-        self.cube = self.add(build_moving_cube(self, "cube", (red, green, blue), xy, z=0.01))
+        colour = self.values.colour("objects.cube_rgb", lambda: draws.uniforms(3).tolist())
+        self.cube = self.add(build_moving_cube(self, "cube", colour, xy, z=0.01))
 
     def start_episode(self, draws: Draws) -> None:
-        draws = Draws(self.seed)
+        draws, values = Draws(self.seed), self.values
         draws.integer(27, 33)
-        self.interval = INTERVALS[draws.integer(0, 3)]
-        self.visit = draws.integer(2, 6) + self.turned("count")
-        angle = math.radians(draws.between(-30, 30))
+        self.interval = values.integer("actions.move_interval", lambda: INTERVALS[draws.integer(0, 3)], least=2)
+        self.visit = values.integer(
+            "actions.stop_time", lambda: draws.integer(2, 6) + self.turned("count"), least=1, most=self.passes
+        )
+        angle = math.radians(values.number("actions.rotation_deg", lambda: draws.between(-30, 30)))
         self._reach = REACH * np.array([-math.sin(angle), math.cos(angle)])
         self.stopped_at: int | None = None
         self._place(0)
 
     def _place(self, k: int) -> None:
         """Put the cube where it is after `k` steps."""
-        passes = PASSES + self.turned("count")
-        pass_index, steps = divmod(min(k, self.interval * passes), self.interval)
-        if pass_index == passes:
-            pass_index, steps = passes - 1, self.interval
+        pass_index, steps = divmod(min(k, self.interval * self.passes), self.interval)
+        if pass_index == self.passes:
+            pass_index, steps = self.passes - 1, self.interval
         side = 2 * smoothstep(steps / self.interval) - 1
         xy = self.target.position[:2] + self._reach * (side if pass_index % 2 == 0 else -side)
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
@@ -69,7 +71,7 @@ class StopCube(Task):
             now = self.steps_done if self.stopped_at is None else self.stopped_at
             return self.visit - now // self.interval
 
-        return tally(row(PASSES + self.turned("count")), left)
+        return tally(row(self.passes), left)
 
     def before_physics(self, k: int) -> None:
         if self.stopped_at is None and pressed(self.button):

@@ -1,18 +1,28 @@
 """SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
 
-from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
-from mme_vla.envs.scene.objects import Cube, Disc, H, build_disc
-from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_disc
+from mme_vla.envs.scene.objects import Cube, Disc, H
+from mme_vla.envs.scene.placement import Avoid, Draws, Region
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, pressed
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import add_cube, pick, press
+from mme_vla.envs.tasks.families.stages import (
+    add_button,
+    add_cube,
+    add_distractors,
+    add_target,
+    check_colour,
+    cube_names,
+    pick,
+    press,
+    sample_colours,
+)
 
 SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
+TABLE = Region((-0.1, 0), 0.25)
 TARGET_RADIUS = 0.04
 NEAR, LEFT = 0.03, 0.04  # a swing is entered within the first distance and left beyond the second
 LOW, HIGH = 0.12, 0.3  # likewise for the cube's height
@@ -51,26 +61,34 @@ class SwingXtimes(Task):
 
     def plan(self, draws: Draws) -> None:
         low, high = SWINGS[self.difficulty]
-        self.repetitions = draws.integer(low, high + 1) + self.turned("count")
+        self.repetitions = self.values.integer(
+            "objects.num_repeats", lambda: draws.integer(low, high + 1) + self.turned("count"), least=1
+        )
 
     def build(self, draws: Draws) -> None:
-        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
-        colours = [("red", "blue", "green")[i] for i in draws.permutation(3)]
+        self.button = add_button(self, draws, (-0.2, 0))
+        colours = sample_colours(self, draws, ("red", "blue", "green"))[: CUBES[self.difficulty]]
         draws.integer(0, 3)
         self.cubes: list[Cube] = []
-        for colour in colours[: CUBES[self.difficulty]]:
-            avoid = [self.button, *self.cubes]
-            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, Region((-0.1, 0), 0.25), avoid))
+        for name in cube_names(self, "layout.cubes", colours):
+            colour, value = name.split("_")[0], f"layout.cubes.{name}"
+            avoid: list[Avoid] = [self.button, *self.cubes]
+            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, avoid, value=value))
         targets: list[Disc] = []
-        for y in (-0.2, 0.2):
-            avoid = [self.button, *self.cubes, *targets]
-            xy = draw_disc(draws, Region((-0.1, y), 0.1), TARGET_RADIUS, avoid, gap=H)
-            if xy is None:
-                raise SceneError(f"SwingXtimes, seed {self.seed}: a target finds no place.")
-            targets.append(self.add(build_disc(self, f"target_{len(targets)}", TARGET_RADIUS, 0.005, "gray", xy)))
+        for i, y in enumerate((-0.2, 0.2)):
+            place, avoid = Region((-0.1, y), 0.1), [self.button, *self.cubes, *targets]
+            value = f"layout.targets.{i}"
+            targets.append(
+                add_target(self, draws, f"target_{i}", value, place, TARGET_RADIUS, avoid, gap=H, colour="gray")
+            )
         # Right and left as the robot sees them.
         self.right, self.left = sorted(targets, key=lambda target: target.position[1])
-        self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+        count = len(self.cubes)
+        self.cube = self.cubes[
+            self.values.integer("objects.target_cube_idx", lambda: draws.integer(0, count), most=count - 1)
+        ]
+        check_colour(self, self.cube.colour)
+        self.distractors = add_distractors(self, draws, TABLE)
         self._marks = [build_mark(self, f"mark_{i}", TARGET_RADIUS * 1.003, 0.014) for i in (0, 1)]
 
     def start_episode(self, draws: Draws) -> None:
@@ -95,8 +113,7 @@ class SwingXtimes(Task):
         for swings in self.swings:
             swings.update()
         early = self.progress.index < len(self.progress.subtasks) - 1 and pressed(self.button)
-        wrong = any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube])
-        return early or wrong or sum(swings.count for swings in self.swings) > 2 * self.repetitions
+        return early or self._wrong_cube() or sum(swings.count for swings in self.swings) > 2 * self.repetitions
 
     def subtasks(self) -> list[SubTask]:
         cube, colour = self.cube, self.cube.colour
@@ -127,12 +144,17 @@ class SwingXtimes(Task):
 
     def _mistaken(self) -> str:
         """Swings too few or too many are a count forgotten; which cube, the goal says."""
-        return "" if any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube]) else "how many"
+        return "" if self._wrong_cube() else "how many"
+
+    def _wrong_cube(self) -> bool:
+        return any_picked_up(self, [cube for cube in (*self.cubes, *self.distractors) if cube is not self.cube])
 
     def choices(self) -> list[Choice]:
         targets = [self.right, self.left]
         return [
-            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice(
+                "a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: [*self.cubes, *self.distractors]
+            ),
             Choice("b", "move to the top of the target", lambda demo, disc: demo.move_over(disc, 0.1), lambda: targets),
             Choice("c", "put the cube on the table", lambda demo, _: demo.put_down()),
             Choice("d", "press the button", lambda demo, _: demo.press(self.button)),

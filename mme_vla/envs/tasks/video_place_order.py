@@ -20,21 +20,43 @@ class VideoPlaceOrder(VideoPlace):
     target_counts: ClassVar[dict[str, int]] = {"easy": 4, "medium": 4, "hard": 4}
 
     def draw_script(self, draws: Draws) -> None:
-        count = draws.integer(2, 5)
-        self.visited = [self.targets[i] for i in draws.permutation(4)[:count]]
-        self.rank = draws.integer(1, count + 1)
-        self.press_after = draws.integer(0, count)
+        values, targets = self.values, len(self.targets)
+
+        def sample() -> list[int]:
+            count = draws.integer(2, 5)
+            return draws.permutation(4)[:count]
+
+        rows = max(values.count("objects.visit_ids_by_object"), 1)
+        if rows != len(self.shown):
+            raise values.error("objects.visit_ids_by_object", f"has {rows} lists for {len(self.shown)} cubes")
+        visits = [values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)]
+        asked = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
+        total = sum(map(len, visits))
+        self.cube = self.cubes[self.shown[asked]]
+        self._visits = [
+            (self.cubes[cube], [self.targets[i] for i in ids]) for cube, ids in zip(self.shown, visits, strict=True)
+        ]
+        self.visited = self._visits[asked][1]
+        count = len(self.visited)
+        self.rank = values.integer("objects.which_in_subset", lambda: draws.integer(1, count + 1), least=1, most=count)
+        self.press_after = values.integer(
+            "objects.button_after_visit_index", lambda: draws.integer(0, count), most=total - 1
+        )
 
     @property
     def goal_target(self) -> Disc:
         return self.visited[self.rank - 1]
 
     def visits(self) -> list[SubTask]:
-        steps = []
-        for i, target in enumerate(self.visited):
-            steps += [self.show_pick(), self.show_drop(target)]
-            if i == self.press_after:
-                steps.append(self.show_press())
+        steps, done = [], 0
+        for cube, targets in self._visits:
+            for target in targets:
+                steps += [self.show_pick(cube), self.show_drop(target, cube)]
+                if done == self.press_after:
+                    steps.append(self.show_press())
+                done += 1
+            if self.tier:
+                steps += self.put_back(cube)
         return steps
 
     def goals(self) -> list[str]:

@@ -10,7 +10,7 @@ from mme_vla.envs.tasks.families.containers import (
     container_picks,
     hiding_goal,
 )
-from mme_vla.envs.tasks.families.stages import wait
+from mme_vla.envs.tasks.families.stages import delay, wait
 
 
 @register_task
@@ -23,8 +23,8 @@ class VideoUnmaskSwap(UnmaskSwap):
         self.build_containers(draws, rotated_anchors(draws, CONTAINERS[self.difficulty]))
 
     def subtasks(self) -> list[SubTask]:
-        watch = wait(self, self.swapped_after + self.turned("delay"))
-        return [watch, *container_picks(self, self.targets, self.containers)]
+        watch = wait(self, self.swapped_after + delay(self))
+        return [watch, *container_picks(self, self.targets, self.all_containers)]
 
     def choices(self) -> list[Choice]:
         return container_choices(self.containers)

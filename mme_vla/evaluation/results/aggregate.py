@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mme_vla.envs.metadata import FURTHER_SPLITS
+from mme_vla.envs.metadata import is_other
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
@@ -284,7 +284,7 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
 def _method(
     model: str, subgoal: str | None, budget: int | None, composition: str | None, runs: list[Run], protocol: Protocol
 ) -> Method:
-    papers = budget in (None, DEFAULT_BUDGET) and all(run.key.split not in FURTHER_SPLITS for run in runs)
+    papers = budget in (None, DEFAULT_BUDGET) and not any(is_other(run.key.split) for run in runs)
     known = paper.paper_method(model, subgoal) if papers else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
@@ -392,8 +392,11 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
         if method.paper and limits != {MAX_STEPS}:
             limit_text = ", ".join(map(str, sorted(limits)))
             notes.append(f"{method.label} ran with a limit of {limit_text} steps; the paper's is {MAX_STEPS}.")
-    for split in sorted({run.key.split for method in methods for run in method.runs} & {*FURTHER_SPLITS}):
-        notes.append(f"Split {split!r}: scenes beyond the benchmark's own; figures of it are none of the benchmark's.")
+    for split in sorted({run.key.split for method in methods for run in method.runs}):
+        if is_other(split):
+            notes.append(
+                f"Split {split!r}: scenes beyond the benchmark's own; figures of it are none of the benchmark's."
+            )
     if outside:
         notes.append(f"{outside} records of other tasks, or of episodes from {protocol.episodes} on, are left out.")
     return notes

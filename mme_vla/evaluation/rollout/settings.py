@@ -9,7 +9,6 @@ from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_
 from mme_vla.envs.base import environment
 from mme_vla.envs.metadata import read_variant
 from mme_vla.errors import UserError
-from mme_vla.evaluation.results.scopes import MAX_STEPS
 
 
 @dataclass(frozen=True)
@@ -17,6 +16,7 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
+    max_steps: actions until the outcome is `timeout`; by default as many as the split allows.
     execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
     env: name of the environment in the registry.
     workers: environments at a time; None: one a core, at most 16.
@@ -31,7 +31,7 @@ class RolloutSettings:
     seed: NonNegativeInt = 42
     split: str = "test"
     env: str = "mme_vla"
-    max_steps: PositiveInt = MAX_STEPS
+    max_steps: PositiveInt = 0  # of the split
     execute: PositiveInt | None = None
     flow_steps: PositiveInt | None = None
     workers: PositiveInt | None = None
@@ -45,7 +45,10 @@ class RolloutSettings:
     subgoal_log: bool = True
 
     def __post_init__(self) -> None:
-        environment(self.env).check_split(self.split)
+        source = environment(self.env)
+        source.check_split(self.split)
+        if not self.max_steps:
+            object.__setattr__(self, "max_steps", source.step_limit(self.split))
         varied = read_variant(self.split) is not None
         if self.env == "official" and (varied or not self.render):
             raise UserError("env=official has its own scenes and always renders: leave out split=… and render=false.")
@@ -53,7 +56,8 @@ class RolloutSettings:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read the keys of a configuration that are settings; others are ignored."""
-        return read_section(cls, config, others=True)
+        given = {key: value for key, value in config.items() if (key, value) != ("max_steps", None)}
+        return read_section(cls, given, others=True)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""

@@ -1,22 +1,31 @@
 """What the two VideoPlace tasks share: a cube is carried over targets in the video; put it on one of them again."""
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import sapien
 
-from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, Swap, under
-from mme_vla.envs.scene.objects import Cube, Disc, H, build_disc
-from mme_vla.envs.scene.placement import Avoid, Draws, Region, SceneError, draw_button, draw_disc
+from mme_vla.envs.scene.objects import Cube, Disc, H
+from mme_vla.envs.scene.placement import Avoid, Draws, Region
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, dropped_onto
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
-from mme_vla.envs.tasks.families.stages import add_cube, end_video, go_home, pick, press, wait
-
-if TYPE_CHECKING:
-    pass
-
+from mme_vla.envs.tasks.families.stages import (
+    add_button,
+    add_cube,
+    add_target,
+    check_colour,
+    cube_names,
+    delay,
+    end_video,
+    go_home,
+    pick,
+    press,
+    sample_colours,
+    wait,
+)
 
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TARGET_RADIUS = 0.04
@@ -24,6 +33,17 @@ TABLE_Z = 0.01
 SUNK_Z = -0.05
 GO_HOME_STEPS, SWAP_STAGE_STEPS = 20, 60
 SWAP_LANE = 0.1
+
+
+class Place(Thing):
+    """Where an object stood at first: a place without a body."""
+
+    def __init__(self, thing: Thing) -> None:
+        self.name, self._at = f"{thing.name}_home", thing.initial_pose
+
+    @property
+    def pose(self) -> sapien.Pose:
+        return self._at
 
 
 class VideoPlace(Task):
@@ -37,29 +57,38 @@ class VideoPlace(Task):
     """What is mistaken by who puts the cube on another target."""
 
     def build(self, draws: Draws) -> None:
-        spot = draw_disc(draws, Region((-0.1, 0), 0.1), self.spot_radius, [], gap=H)
-        if spot is None:
-            raise SceneError(f"{type(self).__name__}, seed {self.seed}: the cube's last spot finds no place.")
-        self.spot = self.add(build_disc(self, "spot", self.spot_radius, 0.005, "purple", spot))
-        self.button = self.add(build_button(self, draw_button(draws, (0.1, 0), (0.05, 0.3))))
-        colours = [("red", "blue", "green")[i] for i in draws.permutation(3)][: CUBES[self.difficulty]]
+        values, table = self.values, Region((0, 0), 0.2)
+        region = Region((-0.1, 0), 0.1)
+        self.spot = add_target(self, draws, "spot", "layout.goal_xy", region, self.spot_radius, [], gap=H)
+        self.button = add_button(self, draws, (0.1, 0), (0.05, 0.3))
+        colours = sample_colours(self, draws, ("red", "blue", "green"))[: CUBES[self.difficulty]]
         avoid: list[Avoid] = [self.spot, self.button]
         self.cubes: list[Cube] = []
-        for colour in colours:
-            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, Region((0, 0), 0.2), avoid))
+        for name in cube_names(self, "layout.cubes", colours):
+            colour, value = name.split("_")[0], f"layout.cubes.{name}"
+            self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, table, avoid, value=value))
             avoid.append(self.cubes[-1])
         self.targets: list[Disc] = []
-        for i in range(self.target_counts[self.difficulty]):
-            xy = draw_disc(draws, Region((0, 0), 0.2), TARGET_RADIUS, avoid, gap=H)
-            if xy is None:
-                raise SceneError(f"{type(self).__name__}, seed {self.seed}: target {i} finds no place.")
-            self.targets.append(self.add(build_disc(self, f"target_{i}", TARGET_RADIUS, 0.005, "purple", xy)))
+        count = values.count("layout.targets") if values.given else self.target_counts[self.difficulty]
+        for i in range(count):
+            value = f"layout.targets.{i}"
+            self.targets.append(add_target(self, draws, f"target_{i}", value, table, TARGET_RADIUS, avoid, gap=H))
             avoid.append(self.targets[-1])
+        if count < 2:
+            raise values.error("layout.targets", f"has {count} targets; expected at least 2")
+        spot = values.find("layout.goal_xy")
         self.spot.set_home(sapien.Pose([*spot, SUNK_Z], self.spot.pose.q))
-        self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+        self.shown = values.indices("objects.demo_ids", lambda: [draws.integer(0, len(self.cubes))], len(self.cubes))
+        if not self.shown:
+            raise values.error("objects.demo_ids", "is empty; expected the cubes of the video")
+        self.cube = self.cubes[self.shown[0]]
         hard = self.difficulty == "hard"
-        self._swapped = [self.targets[i] for i in draws.permutation(len(self.targets))[:2]] if hard else []
+        swapped = values.indices("objects.swap_pair_ids", lambda: draws.permutation(count) if hard else [], count)
+        self._swapped = [self.targets[i] for i in swapped[:2]]
+        if len(self._swapped) == 1:
+            raise values.error("objects.swap_pair_ids", "has one target; expected two, or none")
         self.draw_script(draws)
+        check_colour(self, self.cube.colour)
 
     @abstractmethod
     def draw_script(self, draws: Draws) -> None:
@@ -75,6 +104,7 @@ class VideoPlace(Task):
         """Where the cube belongs."""
 
     def start_episode(self, draws: Draws) -> None:
+        self._homes = {cube: Place(cube) for cube in self.cubes}
         self._swap: Swap | None = None
         self._swap_due = False
 
@@ -95,29 +125,37 @@ class VideoPlace(Task):
 
     def subtasks(self) -> list[SubTask]:
         self._swap_stage = wait(self, SWAP_STAGE_STEPS)
-        after = [
-            self.show_pick(),
-            SubTask(
-                "drop the cube onto table",
-                done=lambda: dropped(self, self.cube),
-                run=lambda demo: demo.place_on(self.spot, TABLE_Z),
-                video=True,
-            ),
-            go_home(self, GO_HOME_STEPS + self.turned("delay")),
-            self._swap_stage,
-            end_video(self),
-        ]
-        return [*self.visits(), *after, *self._execution()]
+        drop = SubTask(
+            "drop the cube onto table",
+            done=lambda: dropped(self, self.cube),
+            run=lambda demo: demo.place_on(self.spot, TABLE_Z),
+            video=True,
+        )
+        leave = [] if self.tier else [self.show_pick(), drop]
+        after = [go_home(self, GO_HOME_STEPS + delay(self)), self._swap_stage, end_video(self)]
+        return [*self.visits(), *leave, *after, *self._execution()]
 
-    def show_pick(self) -> SubTask:
-        """The video's picking up of the cube."""
-        return pick(self, self.cube, "pick up the cube", grounded="", video=True)
+    def put_back(self, cube: Cube) -> list[SubTask]:
+        """Pick the cube up in the video and put it where it stood at first, as in RoboMME-OOD."""
+        home = self._homes[cube]
+        put = SubTask(
+            "put the cube back to its original position",
+            done=lambda: dropped_onto(self, cube, home),
+            run=lambda demo: demo.place_on(home),
+            video=True,
+        )
+        return [self.show_pick(cube), put]
 
-    def show_drop(self, target: Disc) -> SubTask:
-        """The video's dropping of the cube on a target."""
+    def show_pick(self, cube: Cube | None = None) -> SubTask:
+        """The video's picking up of a cube, by default the one to be placed."""
+        return pick(self, cube or self.cube, "pick up the cube", grounded="", video=True)
+
+    def show_drop(self, target: Disc, cube: Cube | None = None) -> SubTask:
+        """The video's dropping of a cube on a target."""
+        moved = cube or self.cube
         return SubTask(
             "drop the cube onto target",
-            done=lambda: dropped_onto(self, self.cube, target),
+            done=lambda: dropped_onto(self, moved, target),
             run=lambda demo: demo.place_on(target),
             targets=[target],
             choice="b",

@@ -1,0 +1,127 @@
+"""Scenes as rows of values: the 800 of RoboMME-OOD, and files of a user's own. Importing this needs no simulator.
+
+A file has one JSON object a line: `task`, `spec` (the values, see `scene/values.py`), and optionally `seed`,
+`difficulty`, `recovery`, `in_view` (as `split=twin`) and `tier`, which brings the rules of RoboMME-OOD. Other keys,
+such as `episode`, are kept and have no effect. `env.scene_values()` gives the row of any scene.
+"""
+
+import json
+import lzma
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from mme_vla.errors import UserError, brief, did_you_mean
+
+Row = dict[str, Any]
+OOD = "ood"
+"""The split of RoboMME-OOD; `ood:xhard3` has the episodes of one tier."""
+TIERS = tuple(f"xhard{i}" for i in range(1, 6))
+SUFFIX = ".jsonl"
+_TIER = re.compile(rf"{OOD}(?::(.+))?")
+_LEVELS = ("easy", "medium", "hard")
+_PARTS = ("layout", "objects", "actions", "initializations")
+_OPTIONAL: dict[str, tuple[Any, ...]] = {
+    "difficulty": _LEVELS, "recovery": ("z", "xy", None), "in_view": (True, False),
+}  # fmt: skip
+
+
+def is_row_split(split: str) -> bool:
+    """Whether the scenes of a split are given as values."""
+    return _TIER.fullmatch(split) is not None or split.endswith(SUFFIX)
+
+
+def rows_of(task: str, split: str, known: tuple[str, ...]) -> list[Row]:
+    """The rows of a task in a split, in order; none where the split has none of the task.
+
+    Args:
+        task: name of a task.
+        split: `ood`, `ood:<tier>`, or the path of a JSONL file.
+        known: names of all tasks.
+
+    Raises:
+        UserError: an unknown tier, or a file that cannot be read.
+    """
+    match = _TIER.fullmatch(split)
+    if match is None:
+        path = Path(split).expanduser()
+        if not path.is_file():
+            raise UserError(f"split={split}: there is no such file. Name a JSONL file of scenes, one object a line.")
+        return list(_read_file(str(path), path.stat().st_mtime_ns, known).get(task, []))
+    if match[1] not in (None, *TIERS):
+        raise UserError(f"split={split!r}: there is no tier {match[1]!r}. {did_you_mean(match[1], TIERS)}")
+    return [row for row in _ood().get(task, []) if match[1] in (None, row["tier"])]
+
+
+@cache
+def _ood() -> dict[str, list[Row]]:
+    packed = files("mme_vla").joinpath("assets", "robomme_metadata", "ood.jsonl.xz").read_bytes()
+    return _by_task(json.loads(line) for line in lzma.decompress(packed).decode().splitlines())
+
+
+@cache
+def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
+    """Rows by task. modified: time of the last change, so that a changed file is read again."""
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} cannot be read as text: {error}.") from error
+    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    if not numbered:
+        raise UserError(f"{path} has no scenes: write one JSON object a line.")
+    return _by_task(_read_line(line, f"{path}, line {number}", known) for number, line in numbered)
+
+
+def _by_task(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    tasks: dict[str, list[Row]] = {}
+    for row in rows:
+        tasks.setdefault(row["task"], []).append(row)
+    return tasks
+
+
+def _read_line(line: str, where: str, known: tuple[str, ...]) -> Row:
+    try:
+        value = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{where} is not JSON: {error}.") from error
+    return check_row(value, where, known)
+
+
+def check_row(value: Any, where: str, known: Sequence[str]) -> Row:
+    """A row whose own fields are valid; those of `spec` are checked when its scene is built.
+
+    Args:
+        value: what was read. where: what an error calls it. known: names of all tasks.
+
+    Raises:
+        UserError: names the field.
+    """
+    if not isinstance(value, Mapping):
+        raise UserError(f"{where} is {brief(value)}; expected an object with task and spec.")
+    row = dict(value)
+    task, spec, seed = row.get("task"), row.get("spec"), row.setdefault("seed", 0)
+    if not isinstance(task, str) or task not in known:
+        raise UserError(f"{where}: task is {brief(task)}. {did_you_mean(str(task), known)}")
+    if not isinstance(spec, Mapping):
+        raise UserError(f"{where}: spec is {brief(spec)}; expected the values as an object of {', '.join(_PARTS)}.")
+    for part, values in spec.items():
+        kind = list if part == "initializations" else dict
+        if part not in _PARTS or not isinstance(values, kind):
+            raise UserError(f"{where}: spec.{part} is {brief(values)}; the parts are {', '.join(_PARTS)}.")
+    if type(seed) is not int or not 0 <= seed < 2**31:
+        raise UserError(f"{where}: seed is {brief(seed)}; expected a whole number from 0.")
+    for name, known in _OPTIONAL.items():
+        if name in row and row[name] not in known:
+            raise UserError(f"{where}: {name} is {brief(row[name])}; expected one of {', '.join(map(str, known))}.")
+    if not isinstance(row.get("tier", ""), str):
+        raise UserError(f"{where}: tier is {brief(row['tier'])}; expected a name, such as {TIERS[0]}.")
+    return row | {"where": where}
+
+
+def task_options(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Keyword arguments of the task whose scene a row describes."""
+    options = {name: row.get(name) for name in ("recovery",)} | {"in_view": bool(row.get("in_view"))}
+    return {"seed": row["seed"], "difficulty": row.get("difficulty", "hard"), "row": row} | options

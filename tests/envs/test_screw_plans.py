@@ -1,0 +1,56 @@
+"""Screw plans equal those of ManiSkill's planner, recorded from `mplib` 0.1.1.
+
+`MME_VLA_PLANS` names another folder with a `screw_plans.json.gz`; by default `../shared/plans` is used where it exists.
+"""
+
+import gzip
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
+
+import sapien
+
+from helpers.env_scenes import Scene
+from mme_vla.envs.robot.kinematics import Arm, matrix_of
+from mme_vla.envs.robot.planning import CONTROL_STEP, plan_screw
+
+FILE = "screw_plans.json.gz"
+KEPT = Path(__file__).resolve().parents[1] / "data" / FILE
+OTHERS = Path(os.environ.get("MME_VLA_PLANS") or Path(__file__).resolve().parents[3] / "shared" / "plans") / FILE
+
+
+@pytest.fixture(scope="module")
+def arm() -> Iterator[Arm]:
+    scene = Scene(lambda _: None)
+    yield Arm(scene.agent)
+    scene.close()
+
+
+@pytest.mark.parametrize("path", [KEPT, OTHERS], ids=["kept", "shared"])
+def test_screw_plans_equal_the_reference(arm: Arm, path: Path) -> None:
+    if not path.is_file():
+        pytest.skip(f"no reference plans: {path} is absent (set MME_VLA_PLANS)")
+    plans = json.loads(gzip.decompress(path.read_bytes()))
+    assert plans
+    for plan in plans:
+        assert plan["time_step"] == CONTROL_STEP
+        arm.base = sapien.Pose(*plan["base"])
+        limits = plan["velocity_limit"], plan["acceleration_limit"]
+        rows = plan_screw(arm, np.array(plan["qpos"]), sapien.Pose(*plan["target"]), *limits)
+        assert rows is not None and rows.shape == np.shape(plan["rows"])
+        np.testing.assert_allclose(rows, plan["rows"], rtol=0, atol=1e-12)
+
+
+def test_poses_keep_double_precision(arm: Arm) -> None:
+    joints = np.array([0.1, 0.3, -0.2, -1.9, 0.1, 2.1, 0.6])
+    nudged = joints + np.array([1e-10, 0, 0, 0, 0, 0, 0])
+    moved = np.abs(arm.transform(nudged) - arm.transform(joints)).max()
+    assert 1e-11 < moved < 1e-9
+    rotation = matrix_of(sapien.Pose([0, 0, 0], [0.5, 0.5, 0.5, 0.5]))[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
