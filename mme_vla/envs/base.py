@@ -113,8 +113,16 @@ class Environment(ABC):
         """The suite of a task."""
         return next((suite for suite, tasks in self.suites.items() if task in tasks), None)
 
-    def open(self, task: str, split: str, episode: int, *, action_space: str | None = None, max_steps: int | None = None,
-             render: bool = True) -> Any:  # fmt: skip
+    def open(
+        self,
+        task: str,
+        split: str,
+        episode: int,
+        *,
+        action_space: str | None = None,
+        max_steps: int | None = None,
+        render: bool = True,
+    ) -> Any:
         """One episode with the interface of `make_env`: lists of frames, status, goal."""
         spec = self.episode(task, split, episode)
         limit = max_steps or self.step_limit(split)
