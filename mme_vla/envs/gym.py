@@ -57,7 +57,7 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         self.task, self.split, self.episode = task, split, episode
         self.images = images or render_mode is not None
         self.render_mode = render_mode
-        self._options = {"action_space": action_space, "reward": reward, "max_steps": max_steps}
+        self._options: dict[str, Any] = {"action_space": action_space, "reward": reward, "max_steps": max_steps}
         self._count = len(episodes(task, split))
         self._env: RoboMMEEnv | None = None
         self._number: int | None = None
@@ -96,7 +96,7 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
             self._take(frames)
         return self._copy(), float(reward), bool(terminated), bool(truncated), self._info(info)
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The newest front image [256, 256, 3]."""
         return self._observation["front"].copy() if self.images and self._observation else None
 
