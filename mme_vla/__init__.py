@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mme_vla.backbone.base import Backbone
     from mme_vla.embodiment import Embodiment
+    from mme_vla.envs.base import Environment
     from mme_vla.envs.make import make_env
     from mme_vla.envs.task import Task
     from mme_vla.envs.vector.pool import make_vec_env
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "backbone.base": ["Backbone"],
     "embodiment": ["Embodiment"],
+    "envs.base": ["Environment"],
     "envs.make": ["make_env"],
     "envs.task": ["Task"],
     "envs.vector.pool": ["make_vec_env"],
@@ -60,9 +62,9 @@ _HOME = {name: f"mme_vla.{module}" for module, names in _MODULES.items() for nam
 
 __all__ = [
     "BACKBONES", "INTEGRATIONS", "MEMORIES", "SUBGOALS", "TASKS", "Backbone", "Batch", "CachedHistory", "Embodiment",
-    "Episode", "History", "HistoryTokens", "HistoryTransform", "Integration", "MMEPolicy", "Memory", "MemoryTokens",
-    "OnlineHistory", "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor", "Task",
-    "UserError", "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe",
+    "Environment", "Episode", "History", "HistoryTokens", "HistoryTransform", "Integration", "MMEPolicy", "Memory",
+    "MemoryTokens", "OnlineHistory", "PerceptualMemory", "Policy", "RecurrentMemory", "StorageSpec", "SubgoalPredictor",
+    "Task", "UserError", "__version__", "build_policy", "evaluate", "load_weights", "make_env", "make_vec_env", "probe",
     "register",
 ]  # fmt: skip
 

@@ -151,6 +151,7 @@ PROMPTS: Registry[Any] = Registry(
     ),
 )
 TASKS: Registry[Any] = Registry("task")
+ENVS: Registry[Any] = Registry("environment", dict.fromkeys(("mme_vla", "official"), "mme_vla.envs.benchmark"))
 PLAYERS: Registry[Any] = Registry(
     "player",
     {
@@ -166,7 +167,7 @@ HISTORY_TRANSFORMS: Registry[Any] = Registry(
 )
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
-    "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
+    "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "env": ENVS, "player": PLAYERS,
     "intervention": INTERVENTIONS, "reward": REWARDS,
     "history_transform": HISTORY_TRANSFORMS, "prompt": PROMPTS,
 }  # fmt: skip
@@ -177,8 +178,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
 
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
-            `subgoal` (a predictor), `task`, `player`, `intervention` (of a probe), `reward`, `history_transform` or
-            `prompt` (a prompt format).
+            `subgoal` (a predictor), `task`, `env`, `player`, `intervention` (of a probe), `reward`,
+            `history_transform` or `prompt` (a prompt format).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

@@ -48,8 +48,8 @@ def main(cfg: DictConfig) -> None:
 def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
     from mme_vla.data.sources import open_sources
+    from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import named_tasks
-    from mme_vla.envs.make import require_simulator
     from mme_vla.evaluation.feed import with_sessions
     from mme_vla.evaluation.recordings import all_recordings
     from mme_vla.evaluation.results.report import policy_facts
@@ -67,10 +67,9 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
         repeat_exactly()
-    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split)
+    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
     shard = choose_shard(values["shard"])
-    if settings.env == "mme_vla":
-        require_simulator()
+    environment(settings.env).check_installed()
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)

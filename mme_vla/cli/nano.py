@@ -70,7 +70,7 @@ def command(cfg: DictConfig) -> None:
     from mme_vla.envs.make import check_names, require_simulator
 
     config = plain(cfg)
-    check_names(config["task"], "mme_vla", "waypoint", None, None)
+    check_names(config["task"], "waypoint", None, None)
     check_counts(config["demonstrations"])
     require(
         isinstance(config["trainings"], int) and config["trainings"] >= 1,

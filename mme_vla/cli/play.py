@@ -5,15 +5,15 @@ import sys
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.config.composition import plain
 from mme_vla.config.sections import PositiveInt, read_section
+from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
-from mme_vla.envs.metadata import step_limit
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
@@ -29,7 +29,7 @@ class PlaySettings:
     """The keys of configs/play.yaml that decide the outcomes, beside the player."""
 
     split: str
-    env: Literal["mme_vla", "official"]
+    env: str
     max_steps: PositiveInt
     max_choices: PositiveInt
 
@@ -37,15 +37,16 @@ class PlaySettings:
 @cli("play")
 def main(cfg: DictConfig) -> None:
     """Play the episodes that are not played yet, on the page or by a model, and compare with the paper."""
+    from mme_vla.envs.rendering import render_backend
     from mme_vla.play import build_player
     from mme_vla.play.web import require_page
 
     config = plain(cfg)
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
-    specs = choose_episodes(named_tasks(config), config["episodes"], config["split"])
+    specs = choose_episodes(named_tasks(config), config["episodes"], config["split"], config["env"])
     if config["max_steps"] is None:
-        config["max_steps"] = step_limit(config["split"])
+        config["max_steps"] = environment(config["env"]).step_limit(config["split"])
     settings: dict[str, Any] = asdict(read_section(PlaySettings, config, others=True))
     settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
     human = player["name"] == HUMAN
@@ -53,8 +54,9 @@ def main(cfg: DictConfig) -> None:
     if human:
         require_page()
     needs_images = built is None or built.needs_images
-    if config["env"] == "mme_vla":
-        _check_simulator(needs_images)
+    environment(config["env"]).check_installed()
+    if config["env"] == "mme_vla" and needs_images:
+        render_backend()
     name, who = (HUMAN, str(player["participant"])) if built is None else (built.model, 0)
     identity = Identity(name, who, player.get("seed", 0), config["max_steps"], settings)
     limits = {limit: config[limit] for limit in ("max_steps", "max_choices")}
@@ -153,12 +155,3 @@ def print_summary(run: PlayRun) -> None:
     console = Console(width=None if sys.stdout.isatty() else 160)
     console.print(table)
     console.print(f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _check_simulator(needs_images: bool) -> None:
-    from mme_vla.envs.make import require_simulator
-    from mme_vla.envs.rendering import render_backend
-
-    require_simulator()
-    if needs_images:
-        render_backend()

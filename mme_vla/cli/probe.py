@@ -13,7 +13,9 @@ from mme_vla.config.composition import plain
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
+    from mme_vla.envs.vector.pool import Job
     from mme_vla.evaluation.recordings import Recording
+    from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.policy.base import Policy
 
 
@@ -23,9 +25,8 @@ logger = logging.getLogger("mme_vla.probe")
 @cli("probe")
 def main(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
-    from mme_vla.envs.episodes import named_tasks
-    from mme_vla.envs.make import require_simulator
-    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, facts_of
+    from mme_vla.envs.base import environment
+    from mme_vla.evaluation.rollout.evaluation import choose_shard, facts_of
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.offline import OfflineSettings
     from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
@@ -41,10 +42,10 @@ def main(cfg: DictConfig) -> None:
         raise UserError(NO_DATA)
     settings = RolloutSettings.from_config(values)
     offline = OfflineSettings.from_config(values)
-    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split) if values["online"] else []
+    jobs = _jobs(values, settings) if values["online"] else []
     shard = choose_shard(values["shard"])
-    if jobs and settings.env == "mme_vla":
-        require_simulator()
+    if jobs:
+        environment(settings.env).check_installed()
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
@@ -65,6 +66,14 @@ def main(cfg: DictConfig) -> None:
             subgoals.close()
     print((report.page.parent / "table.md").read_text(encoding="utf-8"))
     print(report.page)
+
+
+def _jobs(values: dict[str, Any], settings: "RolloutSettings") -> "list[Job]":
+    """The episodes of the closed loop."""
+    from mme_vla.envs.episodes import named_tasks
+    from mme_vla.evaluation.rollout.evaluation import choose_episodes
+
+    return choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
 
 
 def _recordings(data: Any, policy: "Policy") -> "list[Recording]":

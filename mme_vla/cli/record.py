@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 
 from mme_vla.config.plugins import import_plugins, imported_plugins
+from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
-from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
 from mme_vla.envs.rows import task_options
@@ -211,6 +212,10 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.config.sections import read_section
     from mme_vla.data.convert import ConvertOptions
 
+    if cfg.env not in ROBOMME:
+        record_environment(cfg)
+        return
+    require(cfg.env == "mme_vla", f"env={cfg.env} has no demonstrator here: record with env=mme_vla.")
     if not cfg.lerobot and cfg.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
     options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names)
@@ -246,6 +251,17 @@ def run(cfg: "DictConfig") -> None:
         drop_plan(work)
     if cfg.coverage is not None:
         report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
+
+
+def record_environment(cfg: "DictConfig") -> None:
+    """Record demonstrations of an environment of the user's own."""
+    from mme_vla.envs.recording.own import record_own
+
+    source = environment(cfg.env)
+    source.check_installed()
+    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split, cfg.env)
+    frames, failures = record_own(source, specs, Path(cfg.output), cfg.fps)
+    print(f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did not succeed.")
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:

@@ -18,7 +18,7 @@ from mme_vla.evaluation.results.compare import Comparison, common_episodes, comp
 from mme_vla.evaluation.results.curves import process_tables, stress_curves, stress_figures, stress_table
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import read_runs, training_details
-from mme_vla.evaluation.results.scopes import TEST_EPISODES, Protocol, tasks_of
+from mme_vla.evaluation.results.scopes import TASK_FACTS, TEST_EPISODES, Protocol, tasks_of
 from mme_vla.evaluation.results.tables import (
     Table,
     comparison_table,
@@ -89,7 +89,10 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
-    """Episodes of a task in the split that the records are of."""
+    """Episodes of a task in the split that the records are of; of other environments as many as there are records."""
+    own = [record.episode for record in records if split in (None, record.split) and record.extra.get("suite")]
+    if own and not any(record.task in TASK_FACTS for record in records):
+        return 1 + max(own)
     splits = {record.split for record in records if split in (None, record.split)}
     known = {**FURTHER_SPLITS, HARD: HARD_EPISODES}
     counts = {known.get(str(name), TEST_EPISODES) for name in splits}

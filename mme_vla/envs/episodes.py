@@ -4,28 +4,29 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mme_vla.envs import metadata
-from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
-from mme_vla.errors import UserError, check_known, require
-from mme_vla.registry import TASKS
+from mme_vla.envs.base import environment
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.errors import UserError, require
 
 ALL = "all"
 GRAMMAR = "3 for the first three, [3] for number three, 0-9 for a range, [0-3,7] for several, or all"
 
 
-def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
+def choose_tasks(tasks: str | Sequence[str], env: str = "mme_vla") -> list[str]:
     """Names of tasks in the order they are named, each once.
 
     Args:
-        tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names. The user's
-            tasks need the plugin that registers them.
+        tasks: `all` of the environment, a name, several in one text (`StopCube,BinFill`), or a list of names. Tasks
+            of the user's own need the plugin that registers them.
+        env: the environment.
     """
     names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
     names = [str(name).strip() for name in names]
-    names = list(TASK_NAMES) if names == [ALL] else names
+    source = environment(env)
+    names = list(source.tasks) if names == [ALL] else names
     for name in names:
-        check_known("task", name, [*TASK_NAMES, *TASKS, ALL])
-    once = names and len(set(names)) == len(names) and ALL not in names
+        source.check_task(name)
+    once = names and len(set(names)) == len(names)
     require(once, f"tasks={tasks} must name each task once, and at least one.")
     return names
 
@@ -54,11 +55,13 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     return numbers
 
 
-def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, split: str = "test") -> list[EpisodeSpec]:
+def choose_episodes(
+    tasks: str | Sequence[str] = ALL, episodes: Any = None, split: str = "test", env: str = "mme_vla"
+) -> list[EpisodeSpec]:
     """The episodes of a run, task by task."""
     specs = []
-    for task in choose_tasks(tasks):
-        known = metadata.episodes(task, split)
+    for task in choose_tasks(tasks, env):
+        known = environment(env).episodes(task, split)
         specs += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
     return specs
 

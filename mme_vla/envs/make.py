@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
 
 
-ENVS = ("mme_vla", "official")
+ROBOMME = ("mme_vla", "official")
+"""Environments that are RoboMME."""
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 _DIFFICULTIES = ("easy", "medium", "hard")
 
@@ -57,7 +58,8 @@ def make_env(
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
             share for each sub-task of the execution as it is done, 1 in all. Or your own, registered in `REWARDS`.
-        env: `mme_vla`, or `official` for the installed package `robomme`.
+        env: `mme_vla`, `official` for the installed package `robomme`, or an environment of the user's own. Of the
+            options the latter reads `max_steps`, `render` and the action space `multi_choice`.
         sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
@@ -66,7 +68,10 @@ def make_env(
     Returns:
         The environment; call `reset()` first. Close it when done.
     """
-    check_names(task, env, action_space, difficulty, seed)
+    if env not in ROBOMME:
+        options: Any = {"action_space": action_space, "max_steps": max_steps, "render": render}
+        return _open_own(env, task, split, episode, options)
+    check_names(task, action_space, difficulty, seed)
     check_sessions(split, sessions)
     max_steps = metadata.step_limit(split) if max_steps is None else max_steps
     if env == "official":
@@ -109,10 +114,15 @@ def check_sessions(split: str, sessions: int) -> None:
     )
 
 
-def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
+def _open_own(env: str, task: str, split: str, episode: int, options: dict[str, Any]) -> Any:
+    from mme_vla.envs.base import environment
+
+    return environment(env).open(task, split, episode, **options)
+
+
+def check_names(task: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
     """Refuse what can be refused without the simulator."""
     check_task_name(task)
-    check_known("environment", env, ENVS)
     check_known("action space", action_space, ACTION_SPACES)
     if difficulty is not None:
         check_known("difficulty", difficulty, _DIFFICULTIES)

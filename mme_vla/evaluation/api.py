@@ -6,7 +6,8 @@ from typing import Any
 
 from mme_vla.config.sections import read_section
 from mme_vla.data.sources import open_sources
-from mme_vla.envs.make import make_env, require_simulator
+from mme_vla.envs.base import environment
+from mme_vla.envs.make import make_env
 from mme_vla.evaluation.feed import with_sessions
 from mme_vla.evaluation.recordings import all_recordings
 from mme_vla.evaluation.rollout.evaluation import (
@@ -60,9 +61,9 @@ def evaluate(
     0.4
     """
     run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
-    jobs = choose_episodes(tasks, episodes, run_settings.split)
-    if base is make_env and run_settings.env == "mme_vla":
-        require_simulator()
+    jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
+    if base is make_env:
+        environment(run_settings.env).check_installed()
     loaded, source = load(policy)
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     subgoal_label = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__

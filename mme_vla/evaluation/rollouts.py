@@ -277,8 +277,8 @@ class _Collector(Rollout):
         rng = np.random.default_rng([self.settings.seed, job.episode, number, *job.task.encode()])
         return bool(rng.random() < self.oracle_share)
 
-    def _spec(self, job: Job) -> EpisodeSpec:
-        return EpisodeSpec(job.task, job.split, job.episode, 0, "")  # of any environment; no record is written
+    def _spec(self, job: Job) -> tuple[EpisodeSpec, str | None]:
+        return EpisodeSpec(job.task, job.split, job.episode, 0, ""), None  # of any environment; no record is written
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         records: list[EpisodeRecord] = []

@@ -17,7 +17,7 @@ from mme_vla.play.game import ChoiceSession, EpisodeId
 def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int, images: bool = True) -> ChoiceSession:
     """The simulator for one episode.
 
-    episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out. images: whether the
+    episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out. images: whether the
     player reads them; the official environment renders in any case.
     """
     from mme_vla.envs import make_env
@@ -129,7 +129,7 @@ class PlayRun:
         self._log.close()
 
 
-def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str) -> list[EpisodeId]:
+def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str, env: str = "mme_vla") -> list[EpisodeId]:
     """The episodes that the command line names, by the grammar of `mme_vla.envs.episodes`."""
-    specs = choose_specs(tasks, episodes, split)
+    specs = choose_specs(tasks, episodes, split, env)
     return [EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty) for spec in specs]

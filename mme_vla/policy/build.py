@@ -1,5 +1,6 @@
 """`build_policy`: from a variant's name to a policy, through the same YAML files the commands use."""
 
+import copy
 from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.backbone.building import shapes_only
 from mme_vla.config.naming import words
 from mme_vla.config.plugins import import_plugins, plugins_of
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import CacheMemory, Memory, check_grid, past_view_spec
@@ -18,7 +20,7 @@ from mme_vla.policy.saving import policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.prompt import PROMPTS
-from mme_vla.registry import MEMORIES, PROCESSORS
+from mme_vla.registry import ENVS, MEMORIES, PROCESSORS
 
 
 def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: int) -> Memory:
@@ -140,7 +142,7 @@ def build_from_config(
         fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not initialised.
     """
     import_plugins(plugins_of(config, "the configuration"))
-    container = OmegaConf.to_container(config, resolve=True)
+    container = OmegaConf.to_container(with_embodiment(config), resolve=True)
     assert isinstance(container, dict)
     sections = {key: container[key] for key in SECTIONS if key in container}
     check_token_budget(sections)
@@ -151,6 +153,20 @@ def build_from_config(
         torch.manual_seed(container.get("seed", 42) if seed is None else seed)
         policy: Policy = policy_class(sections).from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()
+
+
+def with_embodiment(config: DictConfig) -> DictConfig:
+    """The configuration with the embodiment of `env`, unless another than the default is selected."""
+    name = config.get("env")
+    if name is None or config.embodiment.name != ROBOMME_JOINT.name:
+        return config
+    section = ENVS[name].embodiment
+    if section is None:
+        return config
+    config = copy.deepcopy(config)
+    OmegaConf.set_struct(config, False)
+    config.embodiment = Embodiment.from_dict(section).to_dict()
+    return config
 
 
 def check_token_budget(sections: Mapping[str, Any]) -> None:

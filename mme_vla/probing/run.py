@@ -9,7 +9,8 @@ from typing import Any
 from mme_vla.config.sections import read_section
 from mme_vla.data.console import progress
 from mme_vla.data.sources import open_sources
-from mme_vla.envs.make import make_env, require_simulator
+from mme_vla.envs.base import environment
+from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.api import load
@@ -179,9 +180,9 @@ def probe(
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
     loaded, source = load(policy)
     recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
-    jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split)
-    if jobs and base is make_env and run_settings.env == "mme_vla":
-        require_simulator()
+    jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
+    if jobs and base is make_env:
+        environment(run_settings.env).check_installed()
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})

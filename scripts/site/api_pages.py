@@ -16,6 +16,7 @@ GROUPS = {
     "Evaluation": ["evaluate", "probe", "make_env", "make_vec_env"],
     "Parts to subclass": [
         "Memory", "PerceptualMemory", "RecurrentMemory", "HistoryTransform", "Integration", "Backbone", "Task",
+        "Environment",
         "SubgoalPredictor", "register",
     ],
     "What parts are given": [

@@ -23,3 +23,15 @@ def test_a_launcher_runs_every_job_of_a_sweep(launcher: str, tmp_path: Path) -> 
     assert done.returncode == 0, done.stderr[-3000:]
     probed = {seed: sorted(file.name for file in (tmp_path / seed).iterdir()) for seed in ("7", "42")}
     assert "table.md" in probed["7"] and probed["7"] == probed["42"]
+
+
+@pytest.mark.slow
+def test_ray_runs_every_job_of_a_sweep(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="hydra-ray-launcher is not installed")
+    done = commands.run(
+        "mme_vla.probe", "--multirun", "launcher=ray", "+hydra.launcher.ray.init.num_cpus=1", "seed=7,42",
+        "model=framesamp_modul", *TINY, "recordings=sample", "recorded=1", "with=[shuffle]", "draws=2", "moments=1",
+        "scan=false", f"output={tmp_path}/${{seed}}", f"hydra.sweep.dir={tmp_path}/sweep",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert [(tmp_path / seed / "table.md").is_file() for seed in ("7", "42")] == [True, True]

@@ -31,6 +31,7 @@ EXAMPLES = {
     "add-a-memory.md": "last_frames", "add-a-backbone.md": "regression", "add-an-integration.md": "gist",
     "add-a-task.md": "two_buttons", "your-robot.md": "bimanual", "first-hour.md": "first_hour",
     "auxiliary-losses.md": "write_head", "cached-keys-and-values.md": "fifo", "notes.md": "scratchpad",
+    "environments.md": "blink",
 }  # fmt: skip
 """The folder that the commands of a page are typed in; of other pages it is the repository's root."""
 NOT_RUN = {

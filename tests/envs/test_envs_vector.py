@@ -198,7 +198,7 @@ def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_ou
 def test_unknown_names_are_refused_before_any_process_starts(
     monkeypatch: pytest.MonkeyPatch, arguments: dict[str, Any], words: str
 ) -> None:
-    monkeypatch.setattr("mme_vla.envs.vector.pool.require_simulator", lambda: None)
+    monkeypatch.setattr("mme_vla.envs.make.require_simulator", lambda: None)
     with pytest.raises(UserError, match=words):
         make_vec_env(**arguments)
 

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from mme_vla.config.plugins import import_plugins, imported_plugins
-from mme_vla.envs import metadata
-from mme_vla.envs.make import check_names, make_env, require_simulator
+from mme_vla.envs.base import environment
+from mme_vla.envs.make import ROBOMME, check_names, make_env
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import require
@@ -327,13 +327,13 @@ def make_vec_env(
     names = [tasks] if isinstance(tasks, str) else list(tasks)
     require(names, "No task given; expected a task name or several.")
     numbers = None if episodes is None else list(episodes)
-    jobs = []
+    jobs, env = [], options.get("env", "mme_vla")
+    source = environment(env)
     for name in names:
         if factory is make_env:
-            check_names(name, options.get("env", "mme_vla"), action_space, None, None)
-            if options.get("env", "mme_vla") == "mme_vla":
-                require_simulator()
-        known = metadata.episodes(name, split)
-        for number in range(len(known)) if numbers is None else numbers:
-            jobs.append(Job(name, split, metadata.episode(name, split, number).episode))
+            if env in ROBOMME:
+                check_names(name, action_space, None, None)
+            source.check_installed()
+        for number in range(len(source.episodes(name, split))) if numbers is None else numbers:
+            jobs.append(Job(name, split, source.episode(name, split, number).episode))
     return VecEnv(jobs, workers, factory, {"action_space": action_space, **options}, timeout)

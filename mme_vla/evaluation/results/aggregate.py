@@ -7,7 +7,7 @@ says how many of its episodes there are.
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ from mme_vla.evaluation.results.scopes import (
     Protocol,
     Scope,
     scopes,
+    suites_of,
     tasks_of,
 )
 
@@ -245,6 +246,7 @@ def aggregate(
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))
+    protocol = replace(protocol, own_suites={**suites_of(records), **protocol.own_suites})
     merged = merge(records, conflicts)
     known = {*PAPER_ORDER, *(record.task for record in merged)}
     for task in protocol.tasks:

@@ -9,7 +9,6 @@ import numpy as np
 
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
-from mme_vla.evaluation.results.scopes import OWN, SUITES, task_facts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -92,9 +91,12 @@ def heat_map(results: Results) -> str:
             if rows[edge][0] != "paper":
                 axes.axhline(edge - 0.5, color="white", lw=3)
         boundary = 0
-        for suite in results.protocol.suites:
+        suites = results.protocol.suites
+        for suite in suites:
             boundary += len(results.protocol.choose("suite", suite))
-            if 0 < boundary < len(tasks) and list(tasks) == sorted(tasks, key=_suite_of):
+            if 0 < boundary < len(tasks) and list(tasks) == [
+                task for s in suites for task in results.protocol.choose("suite", s)
+            ]:
                 axes.axvline(boundary - 0.5, color="white", lw=3)
         return svg(canvas)
 
@@ -204,10 +206,6 @@ def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
 
 def _colour(i: int) -> str:
     return COLOURS[i % len(COLOURS)]
-
-
-def _suite_of(task: str) -> int:
-    return (*SUITES, OWN).index(task_facts(task).suite)
 
 
 def _folded(name: str) -> str:

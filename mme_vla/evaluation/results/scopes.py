@@ -1,7 +1,7 @@
 """What a whole run consists of, and the sets of tasks that figures are made over."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mme_vla.errors import require
@@ -83,6 +83,7 @@ class Protocol:
 
     tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are the benchmark's, of
         these: tasks of one's own have figures of their own, beside the average.
+    own_suites: task → suite, of environments that are not RoboMME (`suites_of`).
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation, or `missing`.
     confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
     """
@@ -93,6 +94,7 @@ class Protocol:
     confidence: float = 0.95
     samples: int = 10_000
     seed: int = 0
+    own_suites: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for holds, message in (
@@ -114,12 +116,24 @@ class Protocol:
 
     @property
     def suites(self) -> list[str]:
-        """The suites that take part; `OWN` is the last."""
-        return [suite for suite in (*SUITES, OWN) if self.choose("suite", suite)]
+        """The suites that take part: RoboMME's, those of other environments, `OWN` last."""
+        return [
+            suite for suite in (*SUITES, *dict.fromkeys(self.own_suites.values()), OWN) if self.choose("suite", suite)
+        ]
+
+    def facts(self, task: str) -> Task:
+        """What is known of a task; of an environment's own it is the suite."""
+        facts = task_facts(task)
+        return facts if task in TASK_FACTS else facts._replace(suite=self.own_suites.get(task, OWN))
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""
-        return [task for task in self.tasks if getattr(task_facts(task), attribute) == value]
+        return [task for task in self.tasks if getattr(self.facts(task), attribute) == value]
+
+
+def suites_of(records: Iterable[EpisodeRecord]) -> dict[str, str]:
+    """Task → suite, as the records of other environments than RoboMME name it."""
+    return {r.task: str(r.extra["suite"]) for r in records if r.extra.get("suite") and r.task not in TASK_FACTS}
 
 
 def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:

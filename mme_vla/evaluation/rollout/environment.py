@@ -235,24 +235,29 @@ class _Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
     def __init__(self, robot: Embodiment) -> None:
-        self._cameras = robot.camera_names
-        self._images: dict[str, list[np.ndarray | None]] = {name: [] for name in (*self._cameras, *CAMERAS)}
+        self._cameras, self._width = robot.camera_names, robot.state.width
+        beside = CAMERAS if robot.action.space else ()  # the benchmark's videos show both of its cameras
+        self._images: dict[str, list[np.ndarray | None]] = {name: [] for name in (*self._cameras, *beside)}
         self._readings: dict[str, list[np.ndarray]] = {name: [] for name in robot.readings}
         self._states: list[np.ndarray] = []
 
     def add(self, observation: dict[str, list[Any]]) -> int:
         """Take the benchmark's lists; how many frames they hold."""
-        joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
-        self._states += [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
+        if "state_list" in observation:  # an environment of the user's own
+            states = observation["state_list"]
+        else:
+            joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
+            states = [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
+        self._states += states
         blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
         for name, images in self._images.items():
             if not blind and name in self._cameras:
                 _require(observation, f"{name}_rgb", f"The environment has no camera {name!r}")
-            images += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
+            images += observation.get(f"{name}_rgb_list", [_BLIND] * len(states))
         for name, readings in self._readings.items():
             _require(observation, name, f"The policy reads {name!r}, {MISSING}")
             readings += observation[f"{name}_list"]
-        return len(joints)
+        return len(states)
 
     def leave(self, draw: RenderRequest | None, first: int) -> int:
         """Leave out the images that were not requested; from the first frame's number to the one that follows."""
@@ -270,7 +275,7 @@ class _Frames:
         return zip(*(images[len(self._states) - count :] for images in self._images.values()), strict=True)
 
     def observation(self) -> Observation:
-        state = np.stack(self._states) if self._states else np.zeros((0, ROBOMME_JOINT.state.width), np.float32)
+        state = np.stack(self._states) if self._states else np.zeros((0, self._width), np.float32)
         return {**{name: self._images[name] for name in self._cameras}, **self._readings, "state": state}
 
 

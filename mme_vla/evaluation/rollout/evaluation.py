@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mme_vla.embodiment.robomme import check_benchmark
+from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
-from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
+from mme_vla.envs.make import check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
@@ -42,9 +42,11 @@ class Shard:
         return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
 
 
-def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test") -> list[Job]:
+def choose_episodes(
+    tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test", env: str = "mme_vla"
+) -> list[Job]:
     """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`)."""
-    return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split)]
+    return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split, env)]
 
 
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
@@ -117,7 +119,7 @@ def evaluate(
     check_subgoals(policy, subgoals)
     check_sessions(settings.split, _n_distractors(policy))
     if base is make_env:
-        check_benchmark(policy.embodiment, ACTION_SPACES)
+        environment(settings.env).check_embodiment(policy.embodiment)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
     shard = shard or Shard()
     with RecordLog(output / shard.file) as log:

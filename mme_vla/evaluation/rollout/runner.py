@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mme_vla.envs import metadata
+from mme_vla.envs.base import environment
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError, require
@@ -248,8 +248,10 @@ class Rollout:
         """The chunks [n, h, w] that these episodes execute the first actions of."""
         return self.policy.act([running.episode for running in batch], self.settings.flow_steps)
 
-    def _spec(self, job: Job) -> EpisodeSpec:
-        return metadata.episode(job.task, job.split, job.episode)
+    def _spec(self, job: Job) -> tuple[EpisodeSpec, str | None]:
+        """The episode of a job, and the suite of its task."""
+        source = environment(self.settings.env)
+        return source.episode(job.task, job.split, job.episode), source.suite_of(job.task)
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         """Record an episode and let its worker begin another."""
@@ -257,7 +259,7 @@ class Rollout:
         outcome = status if status in ("success", "fail", "timeout") else "error"
         if outcome == "error":
             error = error or f"the environment ended the episode with the status {status!r}"
-        spec = self._spec(job)
+        spec, suite = self._spec(job)
         robot = self.policy.embodiment
         record = EpisodeRecord(
             **vars(self.facts), action_space=robot.action.answers or robot.name, task=job.task, episode=job.episode,
@@ -266,6 +268,7 @@ class Rollout:
             extra={
                 "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
                 "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
+                **({"suite": suite} if suite else {}),
                 **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
                 **({PROCESS: running.process} if running.process else {}),

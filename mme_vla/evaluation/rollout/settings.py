@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_section
-from mme_vla.envs.metadata import check_split, step_limit
+from mme_vla.envs.base import environment
+from mme_vla.envs.metadata import read_variant
 from mme_vla.errors import UserError
 
 
@@ -17,6 +18,7 @@ class RolloutSettings:
     seed: of the policy's noise; it does not reach the environments.
     max_steps: actions until the outcome is `timeout`; by default as many as the split allows.
     execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
+    env: name of the environment in the registry.
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
     encode_chunk: frames encoded before other episodes may act.
@@ -28,7 +30,7 @@ class RolloutSettings:
 
     seed: NonNegativeInt = 42
     split: str = "test"
-    env: Literal["mme_vla", "official"] = "mme_vla"
+    env: str = "mme_vla"
     max_steps: PositiveInt = 0  # of the split
     execute: PositiveInt | None = None
     flow_steps: PositiveInt | None = None
@@ -43,9 +45,11 @@ class RolloutSettings:
     subgoal_log: bool = True
 
     def __post_init__(self) -> None:
+        source = environment(self.env)
+        source.check_split(self.split)
         if not self.max_steps:
-            object.__setattr__(self, "max_steps", step_limit(self.split))
-        varied = check_split(self.split) is not None
+            object.__setattr__(self, "max_steps", source.step_limit(self.split))
+        varied = read_variant(self.split) is not None
         if self.env == "official" and (varied or not self.render):
             raise UserError("env=official has its own scenes and always renders: leave out split=… and render=false.")
 

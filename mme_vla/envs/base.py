@@ -1,0 +1,229 @@
+"""`Environment`: tasks, their episodes by split, and how one is made. `env=NAME` selects one in every command.
+
+RoboMME is one entry of the registry (`mme_vla/envs/benchmark.py`). An environment of your own is a class beside a
+`gymnasium.Env`, whose observations are a dict: a uint8 image [H, W, 3] for each camera of the embodiment, and `state`,
+float32 [s]. Its info dict may hold `goal` (text, needed on reset), `video` (on reset: earlier observations, which
+become the conditioning video), `success` (bool) and `subgoal` (text).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.action_space import Option
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.errors import check_known, require
+from mme_vla.registry import ENVS
+
+Actions = Sequence[Any]
+"""Actions that `step` takes, one after the other."""
+CHOICES = "multi_choice"
+_FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
+_OTHER_SPLITS = 2_000_000  # first seed of splits with other names
+_LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+class Environment(ABC):
+    """The interface of every environment. A subclass names `tasks` and implements `make`.
+
+    Attributes:
+        tasks: names, in the order of tables.
+        splits: name → episodes of each task.
+        suites: name → tasks; `results` makes a figure of each. A task belongs to at most one.
+        embodiment: as in a file of `configs/embodiment`: the robot of models that are built with `env=NAME`. None where
+            users select one.
+    """
+
+    tasks: ClassVar[Sequence[str]]
+    splits: ClassVar[Mapping[str, int]] = {"train": 100, "val": 50, "test": 50}
+    suites: ClassVar[Mapping[str, Sequence[str]]] = {}
+    embodiment: ClassVar[Mapping[str, Any] | None] = None
+
+    @abstractmethod
+    def make(self, spec: EpisodeSpec, render: bool = True) -> Any:
+        """A `gymnasium.Env` for an episode; the library calls `reset(seed=spec.seed)`."""
+
+    def demonstrate(self, env: Any) -> Iterator[Any]:
+        """Actions that solve the episode of `env`, one for each `step` that the caller performs in between.
+
+        Raises:
+            UserError: the environment has no demonstrator.
+        """
+        require(
+            False, f"{type(self).__name__} has no demonstrator: implement demonstrate(env), a generator of actions."
+        )
+        yield from ()
+
+    def choices(self, env: Any) -> Mapping[str, Actions]:
+        """What can be chosen in `play` now: text → the actions that carry it out. Empty: nothing."""
+        return {}
+
+    def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
+        """The episodes of a task in a split, in order; by default consecutive seeds, other ones in every split."""
+        self.check_task(task)
+        self.check_split(split)
+        first = _FIRST_SEED.get(split, _OTHER_SPLITS)
+        return [EpisodeSpec(task, split, number, first + number, "") for number in range(self.splits[split])]
+
+    # What commands call ---------------------------------------------------------------------------------------------
+
+    def check_task(self, task: str) -> None:
+        """Make sure that a task exists."""
+        check_known("task", task, self.tasks)
+
+    def check_split(self, split: str) -> None:
+        """Make sure that a split exists."""
+        check_known("split", split, self.splits)
+
+    def check_installed(self) -> None:  # noqa: B027
+        """Make sure that packages which the environment needs are installed."""
+
+    def check_embodiment(self, robot: Embodiment) -> None:
+        """Make sure that a policy with this robot can be evaluated here."""
+        if self.embodiment is None:
+            return
+        own = Embodiment.from_dict(self.embodiment)
+        for what, here, there in (
+            ("cameras", set(robot.camera_names) - set(own.camera_names), set[str]()),
+            ("numbers of the state", robot.state.width, own.state.width),
+            ("numbers of an action", robot.action.width, own.action.width),
+        ):
+            require(
+                here == there,
+                f"The robot {robot.name!r} of this policy does not fit the environment's {own.name!r}, which has the "
+                f"cameras {', '.join(own.camera_names)}, {own.state.width} numbers of state and {own.action.width} of "
+                f"an action ({what}). Train with env=<this environment>.",
+            )
+
+    def episode(self, task: str, split: str, number: int) -> EpisodeSpec:
+        """One episode of a split."""
+        known = self.episodes(task, split)
+        exists = type(number) is int and 0 <= number < len(known)
+        require(exists, f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
+        return known[number]
+
+    def step_limit(self, split: str) -> int:
+        """Steps after which an episode of a split is a timeout."""
+        return 1300
+
+    def suite_of(self, task: str) -> str | None:
+        """The suite of a task."""
+        return next((suite for suite, tasks in self.suites.items() if task in tasks), None)
+
+    def open(
+        self,
+        task: str,
+        split: str,
+        episode: int,
+        *,
+        action_space: str | None = None,
+        max_steps: int | None = None,
+        render: bool = True,
+    ) -> Any:
+        """One episode with the interface of `make_env`: lists of frames, status, goal."""
+        spec = self.episode(task, split, episode)
+        limit = max_steps or self.step_limit(split)
+        return EpisodeEnv(self, self.make(spec, render), spec, limit, action_space == CHOICES)
+
+
+def environment(name: str) -> Environment:
+    """The environment of this name."""
+    made: Environment = ENVS[name]()
+    return made
+
+
+class EpisodeEnv:
+    """One episode of a `gymnasium.Env` with the interface of `RoboMMEEnv`: what rollouts and `play` use.
+
+    Args:
+        environment: whose choices are offered. env: its gymnasium environment. spec: which episode.
+        max_steps: steps until the status becomes `timeout`.
+        by_choice: actions are `{"choice": letter}` among `environment.choices`, and all frames of one are returned.
+    """
+
+    def __init__(
+        self, environment: Environment, env: Any, spec: EpisodeSpec, max_steps: int = 1300, by_choice: bool = False
+    ) -> None:
+        self.environment, self.env, self.spec = environment, env, spec
+        self.max_steps, self._by_choice = max_steps, by_choice
+        self._goal, self._steps = "", 0
+        self._choices: dict[str, Actions] = {}
+
+    def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+        """The conditioning video, if there is one, and the current frame."""
+        observation, info = self.env.reset(seed=self.spec.seed)
+        require(isinstance(info.get("goal"), str), f"{self.spec.task}: reset() must return the goal in info['goal'].")
+        self._goal, self._steps = info["goal"], 0
+        return self._lists([*info.get("video", ()), observation]), self._info(info, False, False)
+
+    def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
+        """Perform one action, or all actions of a choice."""
+        frames, total = [], 0.0
+        for part in self._choices[action["choice"].lower()] if self._by_choice else [action]:
+            observation, reward, terminated, truncated, info = self.env.step(part)
+            frames.append(observation)
+            total += float(reward)
+            self._steps += 1
+            truncated = bool(truncated) or self._steps >= self.max_steps
+            if terminated or truncated:
+                break
+        report = self._info(info, bool(terminated), truncated)
+        return self._lists(frames), total, bool(terminated), truncated, report
+
+    def render(self) -> Any:
+        """What the environment renders."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Free the environment."""
+        self.env.close()
+
+    def demonstration(self) -> Iterator[tuple[Mapping[str, Any], Any, bool]]:
+        """Observation, action and whether the frame is of the conditioning video, until the demonstrator is done."""
+        observation, info = self.env.reset(seed=self.spec.seed)
+        self._goal = str(info["goal"])
+        self.success = False
+        actions = self.environment.demonstrate(self.env)
+        first = next(actions, None)
+        require(first is not None, f"{self.spec.task}: the demonstrator gives no action.")
+        for shown in info.get("video", ()):
+            yield shown, np.zeros_like(first), True
+        action: Any = first
+        for _ in range(self.max_steps):
+            yield observation, action, False
+            observation, _, terminated, truncated, info = self.env.step(action)
+            self.success = bool(info.get("success", False))
+            if terminated or truncated or (action := next(actions, None)) is None:
+                return
+
+    @property
+    def goal(self) -> str:
+        """Of the running episode."""
+        return self._goal
+
+    def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+        lists: dict[str, list[Any]] = {"state_list": [np.asarray(frame["state"], np.float32) for frame in frames]}
+        cameras = [name for name in frames[0] if name != "state"] if frames else []
+        lists |= {f"{name}_rgb_list": [np.asarray(frame[name]) for frame in frames] for name in cameras}
+        if self._by_choice and cameras:
+            lists.setdefault("front_rgb_list", lists[f"{cameras[0]}_rgb_list"])  # what `play` shows
+        return lists
+
+    def _info(self, info: Mapping[str, Any], terminated: bool, truncated: bool) -> dict[str, Any]:
+        success = bool(info.get("success", False))
+        over = "fail" if terminated else "timeout" if truncated else "ongoing"
+        report: dict[str, Any] = {
+            "task_goal": [self._goal],
+            "status": "success" if success and (terminated or truncated) else over,
+            "simple_subgoal_online": str(info.get("subgoal", "")),
+        }
+        if self._by_choice:
+            choices = dict(self.environment.choices(self.env))
+            require(choices, f"{type(self.environment).__name__} offers no choices to play: implement choices(env).")
+            self._choices = dict(zip(_LETTERS, choices.values(), strict=False))
+            options = [Option(letter, text) for letter, text in zip(_LETTERS, choices, strict=False)]
+            report["available_multi_choices"] = [option.to_dict() for option in options]
+        return report

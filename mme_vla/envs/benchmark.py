@@ -1,0 +1,60 @@
+"""RoboMME as entries of the registry of environments: `mme_vla`, and `official` for the package `robomme`."""
+
+from typing import Any, ClassVar
+
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.robomme import check_benchmark
+from mme_vla.envs import make, metadata
+from mme_vla.envs.base import Environment
+from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
+from mme_vla.registry import ENVS
+
+
+@ENVS.register("mme_vla")
+class RoboMME(Environment):
+    """The sixteen tasks on stock ManiSkill, and tasks of the user's own; `mme-vla record` demonstrates them."""
+
+    name: ClassVar[str] = "mme_vla"
+    tasks = TASK_NAMES
+
+    def check_task(self, task: str) -> None:
+        """A task of the benchmark, or a registered one."""
+        metadata.check_task_name(task)
+
+    def check_split(self, split: str) -> None:
+        """A split of the benchmark, or a variant."""
+        metadata.check_split(split)
+
+    def step_limit(self, split: str) -> int:
+        """As many as the benchmark allows."""
+        return metadata.step_limit(split)
+
+    def check_installed(self) -> None:
+        """The simulator."""
+        make.require_simulator()
+
+    def check_embodiment(self, robot: Embodiment) -> None:
+        """A robot with one of the benchmark's action spaces and its cameras."""
+        check_benchmark(robot, make.ACTION_SPACES)
+
+    def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
+        """From the benchmark's metadata."""
+        return metadata.episodes(task, split)
+
+    def make(self, spec: EpisodeSpec, render: bool = True) -> Any:
+        """The episode in joint angles."""
+        return make.make_env(spec.task, spec.split, spec.episode, env=self.name, render=render)
+
+    def open(self, task: str, split: str, episode: int, **options: Any) -> Any:
+        """As `make_env`."""
+        return make.make_env(task, split, episode, env=self.name, **options)
+
+
+@ENVS.register("official")
+class Official(RoboMME):
+    """The installed package `robomme`."""
+
+    name = "official"
+
+    def check_installed(self) -> None:
+        """Nothing of this library's simulator; the package is checked when an episode is made."""

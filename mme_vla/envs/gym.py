@@ -1,0 +1,133 @@
+"""The tasks as plain Gymnasium environments, for libraries of reinforcement learning.
+
+>>> gymnasium.make("mme_vla/StopCube-v0", images=False)  # doctest: +SKIP
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE, benchmark_state
+from mme_vla.envs.interface import RoboMMEEnv
+from mme_vla.envs.make import make_env
+from mme_vla.envs.metadata import episodes
+from mme_vla.envs.registration import register_tasks
+from mme_vla.errors import check_choice
+
+_POSITION, _ANGLE = 2.0, 2 * np.pi  # bounds of a commanded pose: metres and radians
+_LOWEST, _HIGHEST = (-2.9, -1.8, -2.9, -3.1, -2.9, -0.02, -2.9), (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9)
+"""Limits of the Panda's joints in radians, rounded outward."""
+SPACES = ("joint_angle", "ee_pose", "waypoint")
+_STATE = ARM_JOINTS + 1
+
+
+class GymTask(gymnasium.Env[Any, np.ndarray]):
+    """A task whose reset samples an episode of a split.
+
+    Observations are a dict of `state` [8] (joints in radians, first finger in metres) and, with `images`, `front` and
+    `wrist` [256, 256, 3] uint8: those of the newest frame. The info dict holds `goal`, `subgoal`, `status` and
+    `success`, and on reset `video`: the front images [t, 256, 256, 3] of the conditioning video, t = 0 without one.
+
+    Args:
+        task: its name.
+        split: whose episodes are sampled; `episode` fixes one of them.
+        action_space: `joint_angle`, `ee_pose` or `waypoint`.
+        reward: `sparse`, `subtask` or `none`.
+        images: whether frames are rendered; without, a step is about 80 times faster.
+        max_steps: steps until an episode is truncated.
+        render_mode: `rgb_array` with images, None without.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str,
+        split: str = "train",
+        episode: int | None = None,
+        action_space: str = "joint_angle",
+        reward: str = "sparse",
+        images: bool = True,
+        max_steps: int = 1300,
+        render_mode: str | None = None,
+    ) -> None:
+        check_choice("action_space", action_space, SPACES)
+        self.task, self.split, self.episode = task, split, episode
+        self.images = images or render_mode is not None
+        self.render_mode = render_mode
+        self._options: dict[str, Any] = {"action_space": action_space, "reward": reward, "max_steps": max_steps}
+        self._count = len(episodes(task, split))
+        self._env: RoboMMEEnv | None = None
+        self._number: int | None = None
+        self._observation: dict[str, np.ndarray] = {}
+        self._stick = self._open(episode or 0).task.stick
+        pose = [_POSITION] * 3 + [_ANGLE] * 3
+        low, high = (_LOWEST, _HIGHEST) if action_space == "joint_angle" else ([-x for x in pose], pose)
+        gripper = [] if self._stick else [1.0]
+        self.action_space = gymnasium.spaces.Box(
+            np.array([*low, *(-x for x in gripper)], np.float32), np.array([*high, *gripper], np.float32)
+        )
+        image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
+        views: dict[str, Any] = dict.fromkeys(CAMERAS, image) if self.images else {}
+        state = gymnasium.spaces.Box(-100.0, 100.0, (_STATE,), np.float32)
+        self.observation_space = gymnasium.spaces.Dict({**views, "state": state})
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Begin an episode; `seed` fixes which episodes follow, `options={"episode": 3}` names one."""
+        super().reset(seed=seed)
+        number = (options or {}).get("episode", self.episode)
+        if number is None:
+            number = int(self.np_random.integers(self._count))
+        frames, info = self._open(number).reset()
+        self._take(frames)
+        shown = frames.get("front_rgb_list", [])[:-1]
+        video = np.stack(shown) if shown else np.zeros((0, SIDE, SIDE, 3), np.uint8)
+        return self._copy(), {**self._info(info), "episode": number, "video": video}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Perform one action; a pose that cannot be reached ends the episode with the status `error`."""
+        assert self._env is not None, "step() before reset(): call reset() first."
+        frames, reward, terminated, truncated, info = self._env.step(np.asarray(action, np.float64))
+        if frames:
+            self._take(frames)
+        return self._copy(), float(reward), bool(terminated), bool(truncated), self._info(info)
+
+    def render(self) -> np.ndarray | None:
+        """The newest front image [256, 256, 3]."""
+        return self._observation["front"].copy() if self.images and self._observation else None
+
+    def close(self) -> None:
+        """Free the simulator; closing twice is harmless."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _open(self, number: int) -> RoboMMEEnv:
+        """The environment of an episode; the last one stays open."""
+        if self._env is None or number != self._number:
+            self.close()
+            env: Any = make_env(self.task, self.split, number, render=self.images, **self._options)
+            self._env, self._number = env, number
+        assert self._env is not None
+        return self._env
+
+    def _take(self, frames: Mapping[str, Sequence[Any]]) -> None:
+        state = benchmark_state(frames["joint_state_list"][-1], frames["gripper_state_list"][-1])
+        views = {name: np.asarray(frames[f"{name}_rgb_list"][-1], np.uint8) for name in CAMERAS if self.images}
+        self._observation = {**views, "state": state}
+
+    def _copy(self) -> dict[str, np.ndarray]:
+        return {name: value.copy() for name, value in self._observation.items()}
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        goals = info.get("task_goal")
+        status = str(info.get("status", ""))
+        texts = {"goal": goals[0] if goals else "", "subgoal": str(info.get("simple_subgoal_online", ""))}
+        return {**texts, "status": status, "success": status == "success"}
+
+
+register_tasks()  # where the entry point is not installed, this import does it
