@@ -126,7 +126,7 @@ def attack(name: str, every: int, times: int, base: Path) -> Outcome:
     ways += [{"after": duration * rng.uniform(0.3, 1)} for _ in range(times)]  # type: ignore[misc]
     for way in ways:
         shutil.rmtree(out, ignore_errors=True)
-        killed, seen, _ = run(words, base, **way)  # type: ignore[arg-type]
+        killed, observed, _ = run(words, base, **way)  # type: ignore[arg-type]
         outcome.kills += killed == -signal.SIGKILL
         again, _, errors = run(words, base)
         files = results(out)
@@ -136,7 +136,7 @@ def attack(name: str, every: int, times: int, base: Path) -> Outcome:
         outcome.wrong += again == 0 and bool(wrong)
         outcome.left += again == 0 and bool(left)
         if again or wrong or left:
-            last = seen[-1] if seen else "no change"
+            last = observed[-1] if observed else "no change"
             outcome.places.append(
                 f"{way} at {last}: exit {again}, {wrong[:4]}, {left[:4]} {errors[-300:] * bool(again)}"
             )

@@ -94,7 +94,7 @@ def shares(pairs: Iterable[tuple[int, int]]) -> str:
     known = list(pairs)
     if not known:
         return "– | – | – | –"
-    differences = [abs(ours - theirs) / theirs for ours, theirs in known]
+    differences = [abs(local - reference) / reference for local, reference in known]
     equal = sum(difference == 0 for difference in differences)
     near = sum(difference <= 0.01 for difference in differences)
     return f"{len(known)} | {equal} | {near} | {100 * statistics.median(differences):.2f}"

@@ -47,9 +47,9 @@ def measure_time(steps: int, every: int) -> None:
     print(
         "| frame | decision | after reading ahead | frames kept | temporal patches kept |\n|---:|---:|---:|---:|---:|"
     )
-    for (step, plain, frames, patches), (_, prepared, _, _) in zip(seconds[False], seconds[True], strict=True):
+    for (step, base, frames, patches), (_, prepared, _, _) in zip(seconds[False], seconds[True], strict=True):
         if step % every == 0:
-            print(f"| {step} | {1e3 * plain:,.0f} ms | {1e3 * prepared:,.0f} ms | {frames} | {patches} |")
+            print(f"| {step} | {1e3 * base:,.0f} ms | {1e3 * prepared:,.0f} ms | {frames} | {patches} |")
 
 
 def count() -> None:

@@ -33,7 +33,7 @@ LARGEST = 2**16
 """Of any size of a robot or a processor: what is larger is a damaged file, and would take memory."""
 
 
-def check_whole(key: str, value: object, most: int = LARGEST) -> int:
+def check_integer(key: str, value: object, most: int = LARGEST) -> int:
     """The value of a key, a whole number from 1 to `most`."""
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
         raise UserError(f"{key} must be a positive whole number to {most}, got {brief(value)}.")

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
-from mme_vla.config.composition import plain
+from mme_vla.config.composition import resolved
 from mme_vla.config.devices import find_device
 from mme_vla.errors import check_choice
 
@@ -62,7 +62,7 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     )
     from mme_vla.evaluation.rollout.settings import RolloutSettings
 
-    values = plain(cfg)
+    values = resolved(cfg)
     settings = RolloutSettings.from_config(values)
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
-from mme_vla.config.composition import command_trees, config_dir, plain
+from mme_vla.config.composition import command_trees, config_dir, resolved
 from mme_vla.errors import UserError, brief, require
 from mme_vla.utils import read_json, write_json
 
@@ -69,7 +69,7 @@ def command(cfg: DictConfig) -> None:
     """Record, train, evaluate and write the page, each as far as it is not there."""
     from mme_vla.envs.make import check_names, require_simulator
 
-    config = plain(cfg)
+    config = resolved(cfg)
     check_names(config["task"], "waypoint", None, None)
     check_counts(config["demonstrations"])
     require(

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.config.composition import plain
+from mme_vla.config.composition import resolved
 from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import named_tasks
@@ -41,7 +41,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.play import build_player
     from mme_vla.play.web import require_page
 
-    config = plain(cfg)
+    config = resolved(cfg)
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
     specs = choose_episodes(named_tasks(config), config["episodes"], config["split"], config["env"])

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
-from mme_vla.config.composition import plain
+from mme_vla.config.composition import resolved
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
     from mme_vla.utils import safe_name
 
-    values = plain(cfg)
+    values = resolved(cfg)
     if values["compare"] is not None:
         print(_table(values["compare"]))
         return

@@ -90,9 +90,9 @@ def run(args: argparse.Namespace) -> None:
 
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     """Episodes of a task in the split that the records are of; of other environments as many as there are records."""
-    own = [record.episode for record in records if split in (None, record.split) and record.extra.get("suite")]
-    if own and not any(record.task in TASK_FACTS for record in records):
-        return 1 + max(own)
+    custom = [record.episode for record in records if split in (None, record.split) and record.extra.get("suite")]
+    if custom and not any(record.task in TASK_FACTS for record in records):
+        return 1 + max(custom)
     splits = {record.split for record in records if split in (None, record.split)}
     known = {**FURTHER_SPLITS, HARD: HARD_EPISODES}
     counts = {known.get(str(name), TEST_EPISODES) for name in splits}

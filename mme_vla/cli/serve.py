@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling
-from mme_vla.config.composition import plain
+from mme_vla.config.composition import resolved
 
 if TYPE_CHECKING:
     from mme_vla.serving.server import PolicyServer
@@ -25,7 +25,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.serving.server import PolicyServer
     from mme_vla.serving.settings import ServeSettings
 
-    settings = ServeSettings.from_dict(plain(cfg))
+    settings = ServeSettings.from_dict(resolved(cfg))
     log_to_terminal(logger, clock=True)
     policy, name, _ = load_policy(cfg, "serve", logger)
     prepare_sampling(policy, cfg.sampling, logger)

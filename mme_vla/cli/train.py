@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.cli.command import cli
-from mme_vla.config.composition import plain
+from mme_vla.config.composition import resolved
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, require
 from mme_vla.utils import remove_drafts, write_atomically
@@ -27,7 +27,7 @@ def main(cfg: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
 
     begun, named = time.perf_counter(), True
-    config = plain(cfg)
+    config = resolved(cfg)
     fresh = Path(config["output"])
     if HydraConfig.initialized():
         fresh = Path(HydraConfig.get().runtime.output_dir)
@@ -62,7 +62,7 @@ def train_several(cfg: DictConfig, folder: Path, count: Any) -> list[Path]:
     for number in range(count):
         one, place = cfg.copy(), folder / training_name(number)
         one.seed, one.output, one.resume = int(cfg.seed) + number, str(place), "auto"
-        config = plain(one)
+        config = resolved(one)
         run = open_run(place, "auto", config)
         if (place / SUMMARY).is_file() and run.checkpoint is not None and run.step == config["train"]["steps"]:
             checkpoints.append(run.checkpoint)

@@ -8,7 +8,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.config.composition import compose, plain
+from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import UserError
 
 logger = logging.getLogger("mme_vla.nano")
@@ -22,7 +22,7 @@ def main(cfg: DictConfig) -> None:
 
     require_simulator()
     log_to_terminal(logger)
-    print(run(plain(cfg)))
+    print(run(resolved(cfg)))
 
 
 def run(config: Mapping[str, Any]) -> Path:

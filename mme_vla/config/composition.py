@@ -161,7 +161,7 @@ def join_plugins(cfg: DictConfig, config_name: str, trees: Sequence[Path], overr
             cfg.plugins = names
 
 
-def plain(cfg: DictConfig) -> dict[str, Any]:
+def resolved(cfg: DictConfig) -> dict[str, Any]:
     """A configuration as resolved plain values."""
     return {str(key): value for key, value in OmegaConf.to_container(cfg, resolve=True).items()}  # type: ignore[union-attr]
 

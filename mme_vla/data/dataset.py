@@ -351,10 +351,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         spec, columns = self.processor.prompt_spec, self.columns[step.source]
         before = step.index - self.processor.embodiment.action.execute
         notes = {name: columns.text(name, step.episode, step.index) for name in spec.notes}
-        written = {name: notes[name] for name in spec.writes}
-        for name in written:
+        stored = {name: notes[name] for name in spec.writes}
+        for name in stored:
             notes[name] = columns.text(name, step.episode, before) if before >= step.exec_start else ""
-        return {"notes": notes, "written": written}
+        return {"notes": notes, "written": stored}
 
 
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:

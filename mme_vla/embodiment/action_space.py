@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from mme_vla.config.sections import section_keys
-from mme_vla.errors import UserError, brief, check_whole, require
+from mme_vla.errors import UserError, brief, check_integer, require
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -170,9 +170,9 @@ class ActionSpace:
         """Read the section `embodiment.action`."""
         where = "embodiment.action"
         values = section_keys(section, where, _KEYS, required=("width",))
-        width = check_whole(f"{where}.width", values["width"])
-        horizon = check_whole(f"{where}.horizon", values.get("horizon", 20))
-        execute = check_whole(f"{where}.execute", values.get("execute", min(16, horizon)))
+        width = check_integer(f"{where}.width", values["width"])
+        horizon = check_integer(f"{where}.horizon", values.get("horizon", 20))
+        execute = check_integer(f"{where}.execute", values.get("execute", min(16, horizon)))
         require(
             execute <= horizon, f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer."
         )
@@ -333,4 +333,4 @@ def _choices(values: Mapping[str, Any], where: str, width: int) -> tuple[tuple[i
         f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length: frames=null.",
     )
     length = values.get("options_length", 0)
-    return choice, point, check_whole(f"{where}.options_length", length) if length else 0
+    return choice, point, check_integer(f"{where}.options_length", length) if length else 0

@@ -10,7 +10,7 @@ from typing import Any, Self
 from mme_vla.config.sections import section_keys
 from mme_vla.embodiment import action_space
 from mme_vla.embodiment.action_space import ActionSpace
-from mme_vla.errors import UserError, brief, check_choice, check_whole, did_you_mean, require
+from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, require
 
 AUGMENTATIONS = ("all", "colour", "none")
 _KEYS = ("name", "cameras", "memory_camera", "state", "action", "fps", "conditioning_video")
@@ -93,7 +93,7 @@ class Embodiment:
             near = did_you_mean(str(memory_camera), names)
             raise UserError(f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}")
         state = section_keys(values["state"], "embodiment.state", ("key", "width"), required=("width",))
-        width = check_whole("embodiment.state.width", state["width"])
+        width = check_integer("embodiment.state.width", state["width"])
         fps, video = values.get("fps"), values.get("conditioning_video", False)
         require(
             not (

@@ -85,17 +85,17 @@ class Environment(ABC):
         """Make sure that a policy with this robot can be evaluated here."""
         if self.embodiment is None:
             return
-        own = Embodiment.from_dict(self.embodiment)
+        mine = Embodiment.from_dict(self.embodiment)
         for what, here, there in (
-            ("cameras", set(robot.camera_names) - set(own.camera_names), set[str]()),
-            ("numbers of the state", robot.state.width, own.state.width),
-            ("numbers of an action", robot.action.width, own.action.width),
+            ("cameras", set(robot.camera_names) - set(mine.camera_names), set[str]()),
+            ("numbers of the state", robot.state.width, mine.state.width),
+            ("numbers of an action", robot.action.width, mine.action.width),
         ):
             require(
                 here == there,
-                f"The robot {robot.name!r} of this policy does not fit the environment's {own.name!r}, which has the "
-                f"cameras {', '.join(own.camera_names)}, {own.state.width} numbers of state and {own.action.width} of "
-                f"an action ({what}). Train with env=<this environment>.",
+                f"The robot {robot.name!r} of this policy does not fit the environment's {mine.name!r}, which has the "
+                f"cameras {', '.join(mine.camera_names)}, {mine.state.width} numbers of state and {mine.action.width} "
+                f"of an action ({what}). Train with env=<this environment>.",
             )
 
     def episode(self, task: str, split: str, number: int) -> EpisodeSpec:
@@ -189,8 +189,8 @@ class EpisodeEnv:
         actions = self.environment.demonstrate(self.env)
         first = next(actions, None)
         require(first is not None, f"{self.spec.task}: the demonstrator gives no action.")
-        for shown in info.get("video", ()):
-            yield shown, np.zeros_like(first), True
+        for visible in info.get("video", ()):
+            yield visible, np.zeros_like(first), True
         action: Any = first
         for _ in range(self.max_steps):
             yield observation, action, False

@@ -84,8 +84,8 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
             number = int(self.np_random.integers(self._count))
         frames, info = self._open(number).reset()
         self._take(frames)
-        shown = frames.get("front_rgb_list", [])[:-1]
-        video = np.stack(shown) if shown else np.zeros((0, SIDE, SIDE, 3), np.uint8)
+        visible = frames.get("front_rgb_list", [])[:-1]
+        video = np.stack(visible) if visible else np.zeros((0, SIDE, SIDE, 3), np.uint8)
         return self._copy(), {**self._info(info), "episode": number, "video": video}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], SupportsFloat, bool, bool, dict[str, Any]]:

@@ -70,7 +70,7 @@ def make_env(
     """
     if env not in ROBOMME:
         options: Any = {"action_space": action_space, "max_steps": max_steps, "render": render}
-        return _open_own(env, task, split, episode, options)
+        return _open_registered(env, task, split, episode, options)
     check_names(task, action_space, difficulty, seed)
     check_sessions(split, sessions)
     max_steps = metadata.step_limit(split) if max_steps is None else max_steps
@@ -114,7 +114,7 @@ def check_sessions(split: str, sessions: int) -> None:
     )
 
 
-def _open_own(env: str, task: str, split: str, episode: int, options: dict[str, Any]) -> Any:
+def _open_registered(env: str, task: str, split: str, episode: int, options: dict[str, Any]) -> Any:
     from mme_vla.envs.base import environment
 
     return environment(env).open(task, split, episode, **options)

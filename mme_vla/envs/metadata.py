@@ -293,9 +293,9 @@ def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
         fields: dict[str, Any] = record if isinstance(record, dict) else {}
         values: list[Any] = [fields.get(key) for key in ("episode", "seed", "difficulty")]
         number, seed, difficulty = values
-        whole = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
+        full = all(type(n) is int and 0 <= n < 2**31 for n in (number, seed))
         require(
-            whole and difficulty in list(_CYCLE),
+            full and difficulty in list(_CYCLE),
             f"{path} is not official metadata: a record has episode {brief(number)}, seed {brief(seed)} and "
             f"difficulty {brief(difficulty)}; expected two whole numbers and one of {', '.join(sorted(set(_CYCLE)))}. "
             "Get the file again.",

@@ -138,8 +138,8 @@ class FedEpisode(Episode):
             at = np.arange(len(states)) if rendered is None or name not in rendered else np.asarray(rendered[name])
             places[name] = np.flatnonzero(np.isin(order, at))
             views[name] = view if (repeats == 1).all() else view[np.searchsorted(at, order[places[name]])]
-        shown = {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
-        self.inner.observe(views, states[order], demo[order], actions, **shown)
+        visible = {} if rendered is None else {"rendered": {name: places[name] for name in rendered}}
+        self.inner.observe(views, states[order], demo[order], actions, **visible)
         if len(self._starts):
             self.boundaries = self.numbers(self._starts)
 
@@ -233,8 +233,8 @@ class FedPolicy(Policy):
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         inner = [inner_episode(episode) for episode in episodes]
-        for episode, own in zip(episodes, inner, strict=True):
-            own.subgoal = episode.subgoal
+        for episode, custom in zip(episodes, inner, strict=True):
+            custom.subgoal = episode.subgoal
         return self.inner.observation(inner)
 
     def predict_chunk(

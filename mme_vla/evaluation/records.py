@@ -10,7 +10,7 @@ from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import parse_json, to_line, verified
 
-Whole = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
+Integer = Annotated[int, Range(-(2**63), 2**63)]  # beyond is damage
 Number = Annotated[float, Range(-(2.0**63), 2.0**63)]
 OUTCOMES = ("success", "fail", "timeout", "error")
 
@@ -77,21 +77,21 @@ class EpisodeRecord:
     """
 
     model: str
-    checkpoint: Whole | str
-    model_seed: Whole
+    checkpoint: Integer | str
+    model_seed: Integer
     task: str
-    episode: Whole
-    seed: Whole
+    episode: Integer
+    seed: Integer
     difficulty: str
     outcome: str
-    steps: Whole
+    steps: Integer
     seconds: Seconds = field(default_factory=Seconds)
     error: str | None = None
     split: str = "test"
-    max_steps: Whole = 1300
+    max_steps: Integer = 1300
     action_space: str = "joint_angle"
     subgoal: str | None = None
-    memory_budget: Whole | None = None
+    memory_budget: Integer | None = None
     composition: str | None = None
     training: TrainingIdentity | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))

@@ -253,12 +253,12 @@ class _Collector(Rollout):
                 return path.chunk
             return policy.predict_chunk(observation, episodes, noise, self.settings.flow_steps)
 
-        chosen = choose_actions(policy, episodes, predict)
+        selection = choose_actions(policy, episodes, predict)
         execute = self.settings.execute or policy.embodiment.action.execute
         log_probs = None if path is None else path.log_prob
         if "log_probs" in self.keep and path is None:
-            log_probs = log_prob(policy, rows[0], chosen.chunk, execute=execute)
-        actions = chosen.actions.copy()
+            log_probs = log_prob(policy, rows[0], selection.chunk, execute=execute)
+        actions = selection.actions.copy()
         for i, running in enumerate(batch):
             oracle = self._oracle.get(running)
             if self.oracle_share and oracle is not None and self._oracle_acts(running):
@@ -267,7 +267,9 @@ class _Collector(Rollout):
             row = rows[0].rows(slice(i, i + 1)).to("cpu") if {"observations", "oracle"} & set(self.keep) else None
             log = None if log_probs is None else log_probs[i].cpu()
             states = None if path is None else path.states[i].cpu()
-            decision = _Decision(row, running.episode.state, chosen.chunk[i], actions[i][:execute], log, states, oracle)
+            decision = _Decision(
+                row, running.episode.state, selection.chunk[i], actions[i][:execute], log, states, oracle
+            )
             self._decisions[running].append(decision)
         return actions
 

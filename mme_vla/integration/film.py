@@ -4,7 +4,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from mme_vla.errors import check_whole
+from mme_vla.errors import check_integer
 from mme_vla.integration.base import Integration, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
@@ -32,7 +32,7 @@ class FiLM(PooledIntegration):
             backbone: sizes, of no concern here. width: of the memory tokens and of the vector.
         """
         super().__init__(backbone)
-        check_whole("integration.width", width)
+        check_integer("integration.width", width)
         self.memory_width = self.feature_width = width
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, width)
 

@@ -62,9 +62,9 @@ class RepeatFrame(HistoryTransform):
         counts = np.ones(length, np.int64)
         count, place = self.frames, exec_start + (self.at or 0)
         if rng is not None:
-            chosen, count = rng.random() < self.p, int(rng.integers(1, self.frames + 1)) if self.frames else 0
+            selection, count = rng.random() < self.p, int(rng.integers(1, self.frames + 1)) if self.frames else 0
             place = int(rng.integers(length)) if self.at is None else place
-            count = count if chosen else 0
+            count = count if selection else 0
         if place < length:
             counts[place] += count
         return counts
@@ -180,7 +180,7 @@ def map_frames(
         rng: see `HistoryTransform.repeats`. keep: frames that stay whatever the transforms leave out: those at which
             the policy decides.
     """
-    real, kept = np.arange(length), np.asarray(keep, np.int64)
+    real, retained = np.arange(length), np.asarray(keep, np.int64)
     for transform in transforms:
         start = int(np.searchsorted(real, exec_start))
         counts = np.array(transform.repeats(len(real), start, rng), np.int64)
@@ -189,7 +189,7 @@ def map_frames(
             f"{type(transform).__name__}.repeats returned {counts.shape} numbers, the least {counts.min(initial=0)}: "
             f"it must return one for each of {len(real)} frames, 0 or more.",
         )
-        last = np.searchsorted(real, kept, side="right") - 1
+        last = np.searchsorted(real, retained, side="right") - 1
         counts[last] = np.maximum(counts[last], 1)
         real = np.repeat(real, counts)
     return FrameMap(real, int(np.searchsorted(real, exec_start)), transforms, rng)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
-from mme_vla.config.composition import compose, import_plugins, plain
+from mme_vla.config.composition import compose, import_plugins, resolved
 from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
 from mme_vla.memory.transforms import build_transforms
@@ -58,7 +58,7 @@ def compose_policy(
     composed = compose("policy", [f"model={model}", *words, *memory_words], extra_dirs=extra_dirs)
     composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
     import_plugins(composed)
-    return plain(composed)
+    return resolved(composed)
 
 
 def build(config: Mapping[str, Any]) -> MMEPolicy:

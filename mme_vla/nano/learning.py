@@ -84,9 +84,9 @@ class Replay:
         for row in rows:
             history, frame = self.rows[row]
             rng = np.random.default_rng([self.seed, epoch, row])
-            shown = map_frames(self.transforms, frame + 1, history.exec_start, rng, keep=[frame])
-            now = int(shown.transformed(np.array(frame)))
-            items.append(self.memory.gather_selection(TransformedHistory(history, shown), now))
+            visible = map_frames(self.transforms, frame + 1, history.exec_start, rng, keep=[frame])
+            now = int(visible.transformed(np.array(frame)))
+            items.append(self.memory.gather_selection(TransformedHistory(history, visible), now))
         return stack_history(items)
 
 

@@ -47,12 +47,12 @@ def choose_actions(
     policy.eval()
     try:
         chunk = predict(batch, noise).float().cpu()
-        written = policy.write_notes(batch, episodes) if isinstance(policy, WritesNotes) else [{} for _ in episodes]
+        stored = policy.write_notes(batch, episodes) if isinstance(policy, WritesNotes) else [{} for _ in episodes]
     finally:
         policy.train(was_training)
     absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
     decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
     actions = torch.stack(decided).numpy()[:, processor.samples.window - 1 :]
-    for episode, actions_of, notes in zip(episodes, actions, written, strict=True):
+    for episode, actions_of, notes in zip(episodes, actions, stored, strict=True):
         episode.acted(actions_of, notes)
     return ChosenActions(batch, chunk, actions)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
 
 
-def own_processor[P](kind: type[P], processor: object, names: str) -> P | None:
+def processor_for[P](kind: type[P], processor: object, names: str) -> P | None:
     """The processor, which must be of the kind that a policy needs; `names` are those of its configurations."""
     if processor is None or isinstance(processor, kind):
         return processor

@@ -46,8 +46,8 @@ def trainings_in(folder: Path) -> list[Path]:
 
 def newest_write(run: Path) -> int:
     """When a run, or one of its trainings, wrote a checkpoint last, in nanoseconds; 0 without a checkpoint."""
-    written = [checkpoints_in(one / CHECKPOINTS) for one in (run, *trainings_in(run))]
-    return max((checkpoints[-1].stat().st_mtime_ns for checkpoints in written if checkpoints), default=0)
+    stored = [checkpoints_in(one / CHECKPOINTS) for one in (run, *trainings_in(run))]
+    return max((checkpoints[-1].stat().st_mtime_ns for checkpoints in stored if checkpoints), default=0)
 
 
 LATEST = "latest"

@@ -97,22 +97,22 @@ class OnlyFrames(History):
         self.frames = dict(zip(self._kept.tolist(), frames.tolist(), strict=True))
         earlier = int((frames < full.exec_start).sum())
         super().__init__(full.spec, int(self._kept[earlier]) if earlier < len(frames) else self._length)
-        self._whole = full
+        self._full_history = full
 
     def __len__(self) -> int:
         return self._length
 
     @property
     def scores(self) -> FrameScores:
-        rows = {frame: i for i, frame in enumerate(self._whole.scores.frames.tolist())}
+        rows = {frame: i for i, frame in enumerate(self._full_history.scores.frames.tolist())}
         # The first frame is remembered whatever its score, as that of an episode is.
         pairs = [(mine, rows[its]) for mine, its in self.frames.items() if mine and its in rows]
-        values = self._whole.scores.values[[row for _, row in pairs]]
+        values = self._full_history.scores.values[[row for _, row in pairs]]
         return FrameScores(np.array([mine for mine, _ in pairs], np.int64), values)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         its = np.array([self.frames[frame] for frame in indices[:, 0].tolist()], np.int64)
-        return self._whole.gather(np.stack([its, indices[:, 1]], axis=1))
+        return self._full_history.gather(np.stack([its, indices[:, 1]], axis=1))
 
 
 class Exchanged(History):
@@ -120,19 +120,19 @@ class Exchanged(History):
 
     def __init__(self, full: History, places: Mapping[int, Place]) -> None:
         super().__init__(full.spec, full.exec_start)
-        self._whole, self._places = full, places
+        self._full_history, self._places = full, places
 
     def __len__(self) -> int:
-        return len(self._whole)
+        return len(self._full_history)
 
     @property
     def scores(self) -> FrameScores:
-        return self._whole.scores
+        return self._full_history.scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
         parts = []
         for frame, patch in indices.tolist():
-            history, its = self._places.get(frame, (self._whole, frame))
+            history, its = self._places.get(frame, (self._full_history, frame))
             parts.append((history, [its, patch]))
         rows: list[Tensor | None] = [None] * len(parts)
         for history in dict.fromkeys(history for history, _ in parts):
@@ -141,7 +141,7 @@ class Exchanged(History):
             for i, row in zip(at, tokens, strict=True):
                 rows[i] = row
         present = [row for row in rows if row is not None]
-        return torch.stack(present) if present else self._whole.gather(indices)
+        return torch.stack(present) if present else self._full_history.gather(indices)
 
 
 @dataclass(frozen=True)

@@ -68,15 +68,15 @@ class DonorEpisode:
     def _seen(self) -> Episode:
         if self._episode is None:
             recording, policy = self.recording, self._policy
-            running, seen = policy.start_episode(recording.goal), 0
+            running, observed = policy.start_episode(recording.goal), 0
             # A bank is written where chunks are chosen; stored frames can be read at any step afterwards.
             stops = [] if self._channel.chooses else recording.decisions(policy.embodiment.action.execute, None)
             for stop in stops:
-                recording.show(running, seen, stop + 1)
-                seen = stop + 1
+                recording.show(running, observed, stop + 1)
+                observed = stop + 1
                 running.subgoal = recording.subgoal(stop, self._said)
                 policy.act([running])
-            recording.show(running, seen, recording.length, stored_frames(policy, recording.length))
+            recording.show(running, observed, recording.length, stored_frames(policy, recording.length))
             self._episode = running
         return self._episode
 

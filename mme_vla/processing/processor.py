@@ -12,7 +12,7 @@ from torch import Tensor
 from mme_vla.backbone.building import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_whole, did_you_mean, listed, require
+from mme_vla.errors import UserError, brief, check_integer, did_you_mean, listed, require
 from mme_vla.processing.base import (
     CONFIG_FILE,
     STATS_FILE,
@@ -138,7 +138,7 @@ class Processor(PolicyProcessor):
             **({} if subgoal_length is None else {"subgoal_length": subgoal_length}),
         }
         for name, value in sizes.items():
-            check_whole(f"processor.{name}", value)
+            check_integer(f"processor.{name}", value)
         require(isinstance(prompt, str), f"processor.prompt must be a name, got {brief(prompt)}.")
         self.prompt_format = PROMPTS[prompt]()
         self.prompt_name = prompt

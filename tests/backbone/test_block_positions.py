@@ -16,9 +16,9 @@ def block(positions: Tensor | None, count: int = 3) -> Block:
 
 def test_equal_coordinates_are_one_position() -> None:
     positions = torch.tensor([[0, 1, 5]])
-    plain, several = rotation(positions, 8), rotation(positions[..., None].expand(-1, -1, 3), 8)
-    assert torch.equal(plain.cos, several.cos) and torch.equal(plain.sin, several.sin)
-    assert not torch.equal(plain.cos, rotation(torch.tensor([[[0, 0, 0], [1, 2, 1], [5, 5, 4]]]), 8).cos)
+    base, several = rotation(positions, 8), rotation(positions[..., None].expand(-1, -1, 3), 8)
+    assert torch.equal(base.cos, several.cos) and torch.equal(base.sin, several.sin)
+    assert not torch.equal(base.cos, rotation(torch.tensor([[[0, 0, 0], [1, 2, 1], [5, 5, 4]]]), 8).cos)
 
 
 def test_blocks_with_one_number_stand_beside_those_with_several() -> None:
@@ -40,8 +40,8 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
     injection = policy.inject(policy.prepare_images(batch), None)
     images, *others = injection.blocks
     counted = torch.arange(len(images))[None, :, None].expand(-1, -1, 3)
-    moved = counted.clone()
-    moved[..., 1] += 3
+    shifted = counted.clone()
+    shifted[..., 1] += 3
     chunk, time = torch.ones(1, policy.horizon, policy.action_dim), torch.full((1,), 0.5)
 
     def velocity(positions: Tensor | None) -> Tensor:
@@ -56,4 +56,4 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
 
     with torch.no_grad():
         assert torch.equal(velocity(None), velocity(counted))
-        assert not torch.equal(velocity(None), velocity(moved))
+        assert not torch.equal(velocity(None), velocity(shifted))

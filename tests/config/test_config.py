@@ -152,11 +152,11 @@ def test_composing_leaves_a_running_hydra_as_it_was(tree: Path) -> None:
 
 
 def test_plugins_of_several_files_add_up(tmp_path: Path) -> None:
-    own = {
+    custom = {
         "model/own.yaml": "# @package _global_\ndefaults: [{/memory: mine}]\nname: own\nplugins: [one]\n",
         "memory/mine.yaml": "# @package _global_\nmemory: {name: framesamp}\nplugins: [two, one]\n",
     }
-    mine = write_tree(tmp_path / "mine", own)
+    mine = write_tree(tmp_path / "mine", custom)
     assert compose("train", ["model=own"], extra_dirs=[mine]).plugins == ["two", "one"]
     assert compose("train", ["model=own", "plugins=[three]"], extra_dirs=[mine]).plugins == ["three"]
 

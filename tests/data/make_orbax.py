@@ -37,8 +37,8 @@ def nested(leaves: dict[str, Any]) -> dict[str, Any]:
 def main(golden: Path) -> None:
     stored = load_file(golden / f"model_{CASE}.safetensors")
     leaves = {name.removeprefix("params/"): leaf for name, leaf in stored.items() if name.startswith("params/")}
-    run, plain = HERE / "orbax_run", HERE / "orbax_plain"
-    for folder in (run, plain):
+    run, base = HERE / "orbax_run", HERE / "orbax_plain"
+    for folder in (run, base):
         shutil.rmtree(folder, ignore_errors=True)
     checkpointer = ocp.PyTreeCheckpointer()
     full = nested({f"params/{name}/value": jnp.asarray(leaf) for name, leaf in leaves.items()})
@@ -57,7 +57,7 @@ def main(golden: Path) -> None:
         "time_mlp_in/kernel": jnp.arange(6, dtype=jnp.bfloat16).reshape(2, 3) / 4,
         "scale": jnp.float32(0.01),
     }
-    ocp.PyTreeCheckpointer(use_ocdbt=False).save(plain, nested(few))
+    ocp.PyTreeCheckpointer(use_ocdbt=False).save(base, nested(few))
     for marker in HERE.glob("orbax_*/**/commit_success.txt"):
         marker.unlink()  # it names the folder on the machine that wrote it
 

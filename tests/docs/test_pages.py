@@ -22,8 +22,8 @@ def prose(text: str) -> str:
 
 def pages() -> list[Path]:
     """Pages written for users."""
-    written = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] != "evidence"]
-    return [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *written]
+    stored = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] != "evidence"]
+    return [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *stored]
 
 
 def test_pages_are_short() -> None:
@@ -53,8 +53,8 @@ def test_the_navigation_has_the_tasks_of_a_user() -> None:
 
 def test_every_page_is_in_the_navigation_once() -> None:
     listed = list(leaves(navigation()))
-    written = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
-    assert sorted(listed) == sorted(written | set(hooks.generated()))
+    stored = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
+    assert sorted(listed) == sorted(stored | set(hooks.generated()))
 
 
 def test_the_documentation_workflow_builds_the_site() -> None:
@@ -95,8 +95,8 @@ def navigation() -> list[dict]:
 
 def leaves(entries: list) -> list[str]:
     """The pages below entries of the navigation."""
-    found = []
+    match = []
     for entry in entries:
         below = next(iter(entry.values())) if isinstance(entry, dict) else entry
-        found += [below] if isinstance(below, str) else leaves(below)
-    return found
+        match += [below] if isinstance(below, str) else leaves(below)
+    return match

@@ -101,9 +101,9 @@ def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytes
     assert training[:5] == ["python", "-m", "mme_vla.train", "--config-dir", "configs"]
     folders = [place / "configs"]
     inspect_main(compose("inspect", inspecting[5:], extra_dirs=folders))
-    looked = capsys.readouterr().out
-    assert "25" in looked, "frames of both episodes"
-    assert "left_0" in looked and "number 1" not in looked
+    inspected = capsys.readouterr().out
+    assert "25" in inspected, "frames of both episodes"
+    assert "left_0" in inspected and "number 1" not in inspected
     cache_main(compose("cache", [*cached[4:], *SMALL, "device=cpu"], extra_dirs=folders))
     assert "2 episodes encoded" in capsys.readouterr().out
     cfg = compose("train", [*training[5:], *SMALL, *BRIEF], extra_dirs=folders)

@@ -43,12 +43,12 @@ def copied(place: str, target: Path) -> Path:
 def assert_rows_equal(rows: list[dict[str, str]], expected: list[dict[str, str]]) -> None:
     """Rows of a table: numbers within the tolerance, all else the same."""
     assert len(rows) == len(expected)
-    for row, wanted in zip(rows, expected, strict=True):
-        for key, value in wanted.items():
+    for row, required in zip(rows, expected, strict=True):
+        for key, value in required.items():
             try:
-                assert float(row[key]) == pytest.approx(float(value), abs=1e-3), (key, wanted)
+                assert float(row[key]) == pytest.approx(float(value), abs=1e-3), (key, required)
             except ValueError:
-                assert row[key] == value, (key, wanted)
+                assert row[key] == value, (key, required)
 
 
 @pytest.mark.parametrize("place", [name for name in EXPECTED["actions"] if not name.startswith("names/")])
@@ -87,9 +87,11 @@ def test_cache_command_finds_every_episode(tmp_path: Path) -> None:
     from make_compatibility_files import command, places
 
     cache = copied("cache", tmp_path / "cache")
-    chosen = [word for word in EXPECTED["words"]["framesamp"] if word.startswith(("model=", "backbone.", "memory."))]
+    selection = [word for word in EXPECTED["words"]["framesamp"] if word.startswith(("model=", "backbone.", "memory."))]
     start = f"init_from={FOLDER / 'training' / 'framesamp'}"
-    assert ": 0 episodes encoded, 2 in all" in command("cache", *chosen, "data=lerobot", *places(FOLDER, cache), start)
+    assert ": 0 episodes encoded, 2 in all" in command(
+        "cache", *selection, "data=lerobot", *places(FOLDER, cache), start
+    )
 
 
 @pytest.mark.parametrize("dataset", ["dataset", "dataset_video"])

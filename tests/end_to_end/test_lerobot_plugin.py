@@ -40,11 +40,11 @@ class MediaPart:
         """Nothing to free."""
 
     def _lists(self, count: int) -> dict[str, Any]:
-        pictures = self.rng.integers(0, 200, (2, count, 256, 256, 3), np.uint8)
+        images = self.rng.integers(0, 200, (2, count, 256, 256, 3), np.uint8)
         at = int(abs(self.joints[0]) * 50) % 200
-        pictures[:, :, at : at + 40, 60:100] = 255
+        images[:, :, at : at + 40, 60:100] = 255
         return {
-            "front_rgb_list": list(pictures[0]), "wrist_rgb_list": list(pictures[1]),
+            "front_rgb_list": list(images[0]), "wrist_rgb_list": list(images[1]),
             "joint_state_list": [self.joints[:7]] * count, "gripper_state_list": [self.joints[6:]] * count,
         }  # fmt: skip
 
@@ -76,9 +76,9 @@ def lerobot_folder(package: ModuleType, our_folder: Path) -> Path:
 def in_process(folder: Path) -> np.ndarray:
     """Actions [2, STEPS, 8] of both episodes, acting together as the library's own loop does."""
     policy, envs = Policy.from_pretrained(folder), [MediaPart(0), MediaPart(1)]
-    seen = [env.reset() for env in envs]
-    episodes = [policy.start_episode(info["task_goal"][0], seed=42) for _, info in seen]
-    waiting = [lists for lists, _ in seen]
+    observed = [env.reset() for env in envs]
+    episodes = [policy.start_episode(info["task_goal"][0], seed=42) for _, info in observed]
+    waiting = [lists for lists, _ in observed]
     done: list[np.ndarray] = []
     while len(done) < STEPS:
         for episode, lists in zip(episodes, waiting, strict=True):

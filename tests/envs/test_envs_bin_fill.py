@@ -95,8 +95,8 @@ def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty)
     assert env.streaming == (stream.integer(0, 2) == 0) == (seed == STREAMING)
     read_button(stream, env.button, (-0.2, 0), (0.1, 0.4))
     x, y, yaw = (stream.uniform() for _ in range(3))
-    turn = np.deg2rad(-20 + 40 * yaw) / 2
-    expected = [-0.05 + 0.2 * x, -0.2 + 0.4 * y, 0.025, np.cos(turn), 0, 0, np.sin(turn)]
+    rotation = np.deg2rad(-20 + 40 * yaw) / 2
+    expected = [-0.05 + 0.2 * x, -0.2 + 0.4 * y, 0.025, np.cos(rotation), 0, 0, np.sin(rotation)]
     np.testing.assert_allclose([*env.board.pose.p, *env.board.pose.q], expected, atol=1e-6)
     pool = [COLOURS[i] for i in stream.permutation(3)][: AVAILABLE[difficulty]]
     colours, total = (stream.integer(low, high + 1) for low, high in (GOAL_COLOURS[difficulty], GOAL_CUBES[difficulty]))

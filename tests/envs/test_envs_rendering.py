@@ -154,8 +154,8 @@ def test_scenes_with_an_environment_map_or_other_shaders_keep_them(software: dic
     def lit(scene: Scene) -> None:
         scene.scene.sub_scenes[0].render_system.cubemap = sapien.render.RenderCubemap(*faces)
 
-    chosen = {"sensor_configs": {"shader_pack": "default"}}
-    for fill, options, expected in ((lit, {}, PACK), (lambda _: None, chosen, "default")):
+    selection = {"sensor_configs": {"shader_pack": "default"}}
+    for fill, options, expected in ((lit, {}, PACK), (lambda _: None, selection, "default")):
         scene = Scene(fill, **options, **software)
         assert pack(scene) == expected
         scene.close()

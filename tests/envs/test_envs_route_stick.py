@@ -58,9 +58,9 @@ def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty,
     monkeypatch.setitem(RouteStick.build.__globals__, "build_obstacle", lambda *a: colours.append(a[-1]) or build(*a))
     env = build_task(RouteStick, seed, difficulty)
     stream = Draws(seed)
-    turn = Rotation.from_euler("z", -30 + 60 * stream.uniform(), degrees=True)
+    rotation = Rotation.from_euler("z", -30 + 60 * stream.uniform(), degrees=True)
     visible, hidden, blocks = (
-        turn.apply([(-0.1, 0.07 * i, z) for i in range(first, 5, 2)])
+        rotation.apply([(-0.1, 0.07 * i, z) for i in range(first, 5, 2)])
         for first, z in ((-4, 0.01), (-3, -0.01), (-3, 0.05))
     )
     np.testing.assert_allclose([disc.position for disc in env.discs], visible, atol=1e-6)
@@ -71,7 +71,7 @@ def test_everything_comes_from_the_stream_in_order(build_task, seed, difficulty,
         shape = thing.entity._bodies[0].collision_shapes[0]
         assert shape.half_size == pytest.approx([0.03, 0.015, 0.05])  # thin along the row, which is its y
         row = Rotation.from_quat(np.roll(thing.pose.q, -1)).apply([0, 1, 0])
-        np.testing.assert_allclose(row, turn.apply([0, 1, 0]), atol=1e-6)
+        np.testing.assert_allclose(row, rotation.apply([0, 1, 0]), atol=1e-6)
     assert colours == [tuple(stream.uniforms(3).tolist()) for _ in range(4)]
     assert ([env.discs.index(disc) for disc in env.route], env.directions) == read_route(stream, *MOVES[difficulty])
 

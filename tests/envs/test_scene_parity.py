@@ -108,15 +108,15 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
     included = {"include_wrist_camera_extrinsic": True, "include_available_multi_choices": True}
     env = make_env(episode.ref.task, action_space=space, render=False, max_steps=5000, **episode.scene, **included)
     env.task.recording = space == "joint_angle"  # drops are judged as when the episode was recorded
-    shown: list[tuple[str, bool]] = []
-    env.on_frame = lambda frame, info, in_video: shown.append((info["simple_subgoal_online"], in_video))
+    visible: list[tuple[str, bool]] = []
+    env.on_frame = lambda frame, info, in_video: visible.append((info["simple_subgoal_online"], in_video))
     observation, info = env.reset()
     video = range(episode.execution)
     assert info["task_goal"] == episode.goals and info["available_multi_choices"] == episode.options
     official = [text(episode.at(k, "info/simple_subgoal_online")) for k in video]
     # A frame whose recorded text is none has the text of the demonstrated sub-task here.
-    assert [now if word != NO_RECORD else word for (now, _), word in zip(shown, official, strict=False)] == official
-    assert [in_video for _, in_video in shown] == [True] * len(official) + [False]
+    assert [now if word != NO_RECORD else word for (now, _), word in zip(visible, official, strict=False)] == official
+    assert [in_video for _, in_video in visible] == [True] * len(official) + [False]
     for k, joints in zip(video, observation["joint_state_list"][:-1], strict=True):
         np.testing.assert_allclose(joints, episode.at(k, "obs/joint_state"), atol=1e-5)
     for k, action in enumerate(episode.actions(space), episode.execution):

@@ -50,7 +50,7 @@ def test_screw_plans_equal_the_reference(arm: Arm, path: Path) -> None:
 def test_poses_keep_double_precision(arm: Arm) -> None:
     joints = np.array([0.1, 0.3, -0.2, -1.9, 0.1, 2.1, 0.6])
     nudged = joints + np.array([1e-10, 0, 0, 0, 0, 0, 0])
-    moved = np.abs(arm.transform(nudged) - arm.transform(joints)).max()
-    assert 1e-11 < moved < 1e-9
+    shifted = np.abs(arm.transform(nudged) - arm.transform(joints)).max()
+    assert 1e-11 < shifted < 1e-9
     rotation = matrix_of(sapien.Pose([0, 0, 0], [0.5, 0.5, 0.5, 0.5]))[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)

@@ -81,6 +81,6 @@ def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFix
             log.append(record)
     page, text = tmp_path / "page.html", tmp_path / "page.md"
     main([str(tmp_path), "--ood", "--html", str(page), "--markdown", str(text)])
-    shown = capsys.readouterr().out
-    assert "RoboMME-OOD" in shown and "Hard test episodes" in shown and "Extrapolation" in shown
+    visible = capsys.readouterr().out
+    assert "RoboMME-OOD" in visible and "Hard test episodes" in visible and "Extrapolation" in visible
     assert "SimpleMemVLA" in text.read_text() and "<svg" in page.read_text()

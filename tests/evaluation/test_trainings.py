@@ -54,11 +54,11 @@ def test_two_recipes_are_not_averaged() -> None:
 
 
 def test_records_without_a_training_have_the_figures_they_had() -> None:
-    plain = [replace(record, training=None) for record in (*records(8), *records(6, model_seed=8))]
-    read = merge([EpisodeRecord.from_json(record.to_json()) for record in plain])
+    base = [replace(record, training=None) for record in (*records(8), *records(6, model_seed=8))]
+    read = merge([EpisodeRecord.from_json(record.to_json()) for record in base])
     lines = [{key: value for key, value in vars(record).items() if key != "training"} for record in read]
     old = [EpisodeRecord.from_dict(line | {"seconds": {}}) for line in lines]
-    figures = [aggregate(part, PROTOCOL).methods[0].average for part in (plain, old)]
+    figures = [aggregate(part, PROTOCOL).methods[0].average for part in (base, old)]
     assert figures[0] == figures[1] and figures[0].std == pytest.approx(np.std([80, 60], ddof=1))
 
 

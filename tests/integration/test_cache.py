@@ -47,23 +47,23 @@ def started(policy: MMEPolicy, seed: int, chunks: int = 0) -> CachingEpisode:
 
 
 def test_an_empty_cache_gives_the_plain_chunk_bitwise(policy: MMEPolicy) -> None:
-    plain = built("pi05")
-    episode, other = started(policy, 1), plain.start_episode("press the button twice", 1)
+    base = built("pi05")
+    episode, other = started(policy, 1), base.start_episode("press the button twice", 1)
     other.observe(*frames(10))
-    assert np.array_equal(policy.act(episode), plain.act(other))
+    assert np.array_equal(policy.act(episode), base.act(other))
     episode.observe(*frames(11))
     other.observe(*frames(11))
-    assert not np.array_equal(policy.act(episode), plain.act(other))
+    assert not np.array_equal(policy.act(episode), base.act(other))
 
 
 def test_the_loss_is_that_of_the_policy_without_memory(policy: MMEPolicy) -> None:
-    plain = built("pi05")
-    batch, noise = random_batch(plain), plain.training_noise(2, torch.Generator().manual_seed(0))
+    base = built("pi05")
+    batch, noise = random_batch(base), base.training_noise(2, torch.Generator().manual_seed(0))
     history = policy.memory.gather_selection(started(policy, 0).required_history(), 2)
     with_memory = replace(
         batch, history=history.__class__(*(x[None].repeat(2, *[1] * x.ndim) for x in history.tensors()))
     )
-    assert torch.equal(policy(with_memory, noise)[0], plain(batch, noise)[0])
+    assert torch.equal(policy(with_memory, noise)[0], base(batch, noise)[0])
 
 
 def test_a_batch_with_unequal_caches_gives_each_episodes_own_chunk(policy: MMEPolicy) -> None:
@@ -98,9 +98,9 @@ def test_a_probe_reads_and_replaces_the_cache_and_writes_nothing(policy: MMEPoli
     batch = policy.observation([episode])
     same = channel.counterfactual(episode, snapshot, [store])
     empty = channel.counterfactual(episode, snapshot, [store.without([0, 1])])
-    kept, without = (channel.predict_chunk(batch, [twin], noise) for twin in (same, empty))
-    assert torch.equal(kept, policy.predict_chunk(batch, [episode], noise))
-    assert not torch.equal(kept, without)
+    retained, without = (channel.predict_chunk(batch, [twin], noise) for twin in (same, empty))
+    assert torch.equal(retained, policy.predict_chunk(batch, [episode], noise))
+    assert not torch.equal(retained, without)
     assert episode.cache is before
     channel.commit(episode, empty)
     episode.acted(np.zeros((20, 8), np.float32))

@@ -43,11 +43,11 @@ EVERY = [RepeatFrame(16), Speed(2.0), DropFrames(0.5)]
 def test_a_map_is_ascending_and_ends_at_the_current_frame(transform: HistoryTransform) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        shown = map_frames([transform], 40, 10, rng, keep=[39])
-        assert (np.diff(shown.real) >= 0).all() and shown.real[-1] == 39
-        assert (shown.real[: shown.exec_start] < 10).all() and shown.real[shown.exec_start] >= 10
+        visible = map_frames([transform], 40, 10, rng, keep=[39])
+        assert (np.diff(visible.real) >= 0).all() and visible.real[-1] == 39
+        assert (visible.real[: visible.exec_start] < 10).all() and visible.real[visible.exec_start] >= 10
         again = map_frames([transform], 40, 10, np.random.default_rng(seed), keep=[39])
-        assert np.array_equal(shown.real, again.real)
+        assert np.array_equal(visible.real, again.real)
 
 
 @pytest.mark.parametrize("transform", [*EVERY, Speed(0.5)])
@@ -79,10 +79,10 @@ def test_a_feed_shows_frames_as_the_map_does() -> None:
 def test_a_frame_without_tokens_is_replaced_by_the_newest_stored_one_before_it() -> None:
     spec, stored = StorageSpec(1, keep_every=4), np.array([0, 3, 7, 11])
     tokens = stored[:, None, None].astype(np.float32)
-    shown = map_frames([Speed(0.5)], 12, 0)
-    history = TransformedHistory(CachedHistory(spec, tokens, stored, 12), shown)
+    visible = map_frames([Speed(0.5)], 12, 0)
+    history = TransformedHistory(CachedHistory(spec, tokens, stored, 12), visible)
     frames = np.array([0, 7, 13, 15])
-    assert shown.real[frames].tolist() == [0, 3, 6, 7]
+    assert visible.real[frames].tolist() == [0, 3, 6, 7]
     assert history.gather(np.stack([frames, np.zeros(4, int)], 1))[:, 0].tolist() == [0, 3, 3, 7]
 
 
@@ -119,19 +119,19 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Processor, li
 
 def test_samples_are_transformed_by_seed_epoch_and_index(sample: Any) -> None:
     sources, processor, caches = sample
-    plain = TrainingDataset(sources, processor, LastFrames(), caches)
+    base = TrainingDataset(sources, processor, LastFrames(), caches)
     changed = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(32, p=1.0)])
     items = [changed[60], changed[60]]
-    assert same(*items) and not same(items[0]["history"], plain[60]["history"])
-    assert int(items[0]["history"].step) > int(plain[60]["history"].step)
+    assert same(*items) and not same(items[0]["history"], base[60]["history"])
+    assert int(items[0]["history"].step) > int(base[60]["history"].step)
     for key in ("images", "state", "actions", "prompt"):
         if key in items[0]:
-            assert torch.equal(items[0][key], plain[60][key]), key
+            assert torch.equal(items[0][key], base[60][key]), key
     changed.set_epoch(1)
     assert not same(changed[60]["history"], items[0]["history"])
-    assert same(changed.observation(60), plain.observation(60)), "what a policy meets when acting is not transformed"
+    assert same(changed.observation(60), base.observation(60)), "what a policy meets when acting is not transformed"
     nothing = TrainingDataset(sources, processor, LastFrames(), caches, transforms=[RepeatFrame(0)])
-    assert same(nothing[60]["history"], plain[60]["history"])
+    assert same(nothing[60]["history"], base[60]["history"])
 
 
 def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,9 +140,9 @@ def test_past_actions_go_through_the_map(sample: Any, monkeypatch: pytest.Monkey
     steps = (data.step(index) for index in range(20, len(data)))
     step = next(s for s in steps if len(np.unique(sources[0].actions(s.episode, s.index - 4, s.index), axis=0)) > 1)
     exec_start = int(sources[0].exec_starts[step.episode])
-    shown = map_frames([RepeatFrame(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index])
+    visible = map_frames([RepeatFrame(5, step.index - exec_start - 1)], step.index + 1, exec_start, keep=[step.index])
     monkeypatch.setattr(Processor, "prompt_spec", replace(processor.prompt_spec, past_actions=4))
-    past = data.past_actions(step, shown)
+    past = data.past_actions(step, visible)
     repeated = sources[0].actions(step.episode, step.index - 1, step.index)
     assert np.array_equal(past, np.repeat(repeated, 4, 0))
     assert len(data.past_actions(step)) == 4 and not np.array_equal(data.past_actions(step), past)
@@ -152,24 +152,24 @@ def test_the_times_of_a_group_are_transformed(sample: Any, monkeypatch: pytest.M
     sources, processor, caches = sample
     monkeypatch.setattr(Processor, "samples", replace(processor.samples, group_size=4))
     groups = [GroupDataset(sources, processor, LastFrames(), caches, transforms=t) for t in ((), [Speed(0.5)])]
-    plain, slow = (group[1] for group in groups)
-    assert plain["place"] == slow["place"] and (slow["times"] >= plain["times"]).all()
-    assert slow["times"][-1] > plain["times"][-1]
+    base, slow = (group[1] for group in groups)
+    assert base["place"] == slow["place"] and (slow["times"] >= base["times"]).all()
+    assert slow["times"][-1] > base["times"][-1]
     assert [int(m["history"].step) for m in slow["moments"]] == slow["times"].tolist()
 
 
 def test_nano_redraws_histories_each_epoch() -> None:
     policy, made = nano().eval(), demonstration()
     policy.require_processor().stats = statistics([made], policy)
-    plain = Decisions.of(policy, [made])
+    base = Decisions.of(policy, [made])
     first, again = (Decisions.of(policy, [made], transforms=[RepeatFrame(32)], seed=1) for _ in range(2))
     rows = [0, 1, 2]
     one = first.collate(rows).history
-    assert one is not None and same(one, again.collate(rows).history) and not same(one, plain.collate(rows).history)
+    assert one is not None and same(one, again.collate(rows).history) and not same(one, base.collate(rows).history)
     first.set_epoch(1)
     assert not same(first.collate(rows).history, one)
     still = Decisions.of(policy, [made], transforms=[RepeatFrame(0)], seed=1)
-    assert same(still.collate(rows).history, plain.collate(rows).history)
+    assert same(still.collate(rows).history, base.collate(rows).history)
 
 
 def test_a_probe_applies_the_same_objects(tmp_path: Path) -> None:

@@ -71,9 +71,9 @@ class Noting(ProbedPolicy):
     """Notes the times of what is remembered at every chunk."""
 
     def snapshot(self, episode: ProbedEpisode, drawn: Any = None) -> Any:
-        found = super().snapshot(episode, drawn)
-        self.noted.append((episode.n_observed_frames - 1, [entry.time for entry in found[1][0].entries]))
-        return found
+        match = super().snapshot(episode, drawn)
+        self.noted.append((episode.n_observed_frames - 1, [entry.time for entry in match[1][0].entries]))
+        return match
 
 
 @pytest.mark.parametrize("arm", ["oracle", "pause:8+oracle"])

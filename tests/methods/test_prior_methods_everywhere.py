@@ -134,12 +134,12 @@ RESUMED = {
 def test_it_trains_by_the_command_and_resumes_to_the_bit(case: str, data: Callable[[str], str], tmp_path: Path) -> None:
     pytest.importorskip("diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines")
     model, words = RESUMED[case]
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    straight = load_tensors(update(model, data(model), whole, *words, "train.steps=2"))
+    full, parts = tmp_path / "whole", tmp_path / "parts"
+    straight = load_tensors(update(model, data(model), full, *words, "train.steps=2"))
     update(model, data(model), parts, *words, "train.steps=1")
     last = update(model, data(model), tmp_path / "unused", *words, "train.steps=2", f"resume={parts}")
     assert last == parts / "checkpoints" / "step_000002"
-    assert losses(parts) == losses(whole) and len(losses(parts)) == 2 and np.isfinite(losses(parts)).all()
+    assert losses(parts) == losses(full) and len(losses(parts)) == 2 and np.isfinite(losses(parts)).all()
     resumed = load_tensors(last)
     assert all(torch.equal(tensor, resumed[name]) for name, tensor in straight.items())
     assert bool(Policy.from_pretrained(last).config.get("adapters")) == (case == "adapters")

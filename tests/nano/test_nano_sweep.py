@@ -9,7 +9,7 @@ import pytest
 from helpers.nano_policies import demonstration
 from mme_vla.cli import nano as command
 from mme_vla.cli.nano import with_settings
-from mme_vla.config.composition import compose, plain
+from mme_vla.config.composition import compose, resolved
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.nano import evaluating, fitting, learning
 from mme_vla.nano.demonstrations import Demonstration
@@ -56,7 +56,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul,tokendrop_modul", "budget=2,4"])
     words += ["trainings=2", "beside=[]", "drawn_for=[]", "planner=false", "films=false", f"output={tmp_path / 'run'}"]
     words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]
-    page = command.run(plain(compose("nano", words))).read_text()
+    page = command.run(resolved(compose("nano", words))).read_text()
     assert len(recorded) == 1 and made == [2, 2, 4, 4, 2, 2, 4, 4]  # to learn from and to measure by
     for name in ("framesamp_modul-every_8-grid_1", "tokendrop_modul-grid_1"):
         assert all(f"| {name} | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
@@ -64,7 +64,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     seeds = [identity_of(MMEPolicy.from_pretrained(str(run)).config) for run in
              fitting.training_folders(tmp_path / "run" / "framesamp_modul@2", 2)]  # fmt: skip
     assert [one and one.seed for one in seeds] == [0, 1] and seeds[0] != seeds[1]
-    command.run(plain(compose("nano", words)))
+    command.run(resolved(compose("nano", words)))
     assert len(made) == 8, "a finished run is not made again"
 
 

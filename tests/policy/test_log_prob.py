@@ -76,8 +76,8 @@ def test_a_head_with_deviation_samples_the_path_of_its_noise() -> None:
 
     path = head.sample_path(linear, noise["noise"], noise["increments"], 0.3)
     assert torch.equal(head.sample(linear, noise["noise"], steps, increments=noise["increments"]), path[:, -1])
-    plain = head.sample(linear, noise["noise"], steps)
-    assert torch.equal(head.sample_path(linear, noise["noise"], noise["increments"], 0.0)[:, -1], plain)
+    base = head.sample(linear, noise["noise"], steps)
+    assert torch.equal(head.sample_path(linear, noise["noise"], noise["increments"], 0.0)[:, -1], base)
     assert set(FlowHead(horizon=2, action_dim=3).sampling_noise(generator)) == {"noise"}
     with pytest.raises(UserError, match="flow_steps=5"):
         head.sample(linear, noise["noise"], 5, increments=noise["increments"])

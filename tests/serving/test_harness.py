@@ -98,18 +98,18 @@ def in_process(policy: MMEPolicy, numbers: list[int]) -> np.ndarray:
     """Actions [n, STEPS, 8] of the same episodes, acting together."""
     worlds = [Scripted(number) for number in numbers]
     episodes = [policy.start_episode(f"touch square {number}", seed=42) for number in numbers]
-    seen = [[world.reset(None)] for world in worlds]
+    observed = [[world.reset(None)] for world in worlds]
     for episode, world in zip(episodes, worlds, strict=True):
         if world.video:
             episode.add_frames(np.stack(world.video), is_demo=True)
     while len(worlds[0].taken) < STEPS:
-        for episode, frames in zip(episodes, seen, strict=True):
+        for episode, frames in zip(episodes, observed, strict=True):
             views = {"front": "agentview", "wrist": "wrist"}
-            pictures = {camera: np.stack([f["images"][name] for f in frames]) for camera, name in views.items()}
-            episode.observe(pictures, np.stack([frame["states"] for frame in frames]))
+            images = {camera: np.stack([f["images"][name] for f in frames]) for camera, name in views.items()}
+            episode.observe(images, np.stack([frame["states"] for frame in frames]))
         chunks = policy.act(episodes)[:, :16]
         left = STEPS - len(worlds[0].taken)
-        seen = [[w.step({"actions": a}).obs for a in c[:left]] for w, c in zip(worlds, chunks, strict=True)]
+        observed = [[w.step({"actions": a}).obs for a in c[:left]] for w, c in zip(worlds, chunks, strict=True)]
     return np.stack([world.taken for world in worlds])
 
 

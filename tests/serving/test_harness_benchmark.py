@@ -48,9 +48,9 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
     """The actions [STEPS, 8] of the same episode without the harness."""
     env, taken = make_env(TASK, "test", EPISODE, max_steps=STEPS), []
     try:
-        seen, info = env.reset()
+        observed, info = env.reset()
         episode = policy.start_episode(info["task_goal"][0], seed=42)
-        frames = [seen]
+        frames = [observed]
         while len(taken) < STEPS:
             images = {name: np.stack([f[f"{name}_rgb_list"][-1] for f in frames]) for name in ("front", "wrist")}
             arms = [[*f["joint_state_list"][-1], f["gripper_state_list"][-1][0]] for f in frames]

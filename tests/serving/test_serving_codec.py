@@ -20,7 +20,7 @@ ARRAY_BYTES = (
     b"\xc4\x05dtype\xa3<i2"
     b"\xc4\x05shape\x92\x02\x02"
 )
-PICTURE = np.zeros((16, 16, 3), np.uint8)
+IMAGE = np.zeros((16, 16, 3), np.uint8)
 
 
 def raw_array(**changes: object) -> bytes:
@@ -88,15 +88,15 @@ def test_random_bytes_never_raise_anything_else():
 
 def test_requests_are_recognised_by_their_keys():
     assert isinstance(parse({"reset": True}, 10), Reset)
-    added = parse({"add_buffer": True, "images": PICTURE[None, None], "state": states(1), "exec_start_idx": 3}, 10)
+    added = parse({"add_buffer": True, "images": IMAGE[None, None], "state": states(1), "exec_start_idx": 3}, 10)
     assert isinstance(added, AddBuffer) and added.exec_start == 3 and len(added.frames) == 1
-    native = parse(observation(PICTURE, PICTURE, states(1)[0], grounded_subgoal="pick at <3, 4>"), 10)
+    native = parse(observation(IMAGE, IMAGE, states(1)[0], grounded_subgoal="pick at <3, 4>"), 10)
     assert (
         isinstance(native, Infer)
         and native.frames is None
         and native.subgoals == {"grounded_subgoal": "pick at <3, 4>"}
     )
-    challenge_request = parse(challenge([PICTURE] * 2, [PICTURE] * 2, states(2), True), 10)
+    challenge_request = parse(challenge([IMAGE] * 2, [IMAGE] * 2, states(2), True), 10)
     assert isinstance(challenge_request, Infer) and challenge_request.first and challenge_request.goal == GOAL
     assert np.array_equal(challenge_request.state, states(2)[-1])
 
@@ -104,14 +104,14 @@ def test_requests_are_recognised_by_their_keys():
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"front_rgb_list": [PICTURE.astype(np.float32)]}, "front_rgb_list"),
-        ({"front_rgb_list": [PICTURE] * 3}, "front_rgb_list has 3"),
+        ({"front_rgb_list": [IMAGE.astype(np.float32)]}, "front_rgb_list"),
+        ({"front_rgb_list": [IMAGE] * 3}, "front_rgb_list has 3"),
         ({"front_rgb_list": []}, "front_rgb_list holds 0"),
-        ({"front_rgb_list": [PICTURE] * 11}, r"holds 11 frames.*limits\.frames"),
+        ({"front_rgb_list": [IMAGE] * 11}, r"holds 11 frames.*limits\.frames"),
         ({"front_rgb_list": "pictures"}, "front_rgb_list"),
         ({"front_rgb_list": [np.zeros((16, 1000, 3), np.uint8)]}, "narrow"),
         ({"front_rgb_list": [np.zeros((4, 4, 3), np.uint8)]}, "sides"),
-        ({"wrist_rgb_list": [PICTURE[..., 0]]}, "wrist_rgb_list"),
+        ({"wrist_rgb_list": [IMAGE[..., 0]]}, "wrist_rgb_list"),
         ({"joint_state_list": [np.full(7, np.nan, np.float32)]}, "finite"),
         ({"joint_state_list": [np.zeros(6)]}, r"joint_state_list.*\[7\]"),
         ({"joint_state_list": [np.array(["a"] * 7)]}, "numbers"),
@@ -125,7 +125,7 @@ def test_requests_are_recognised_by_their_keys():
     ],
 )
 def test_a_wrong_value_is_named(change, named):
-    right = challenge([PICTURE], [PICTURE], states(1), True)
+    right = challenge([IMAGE], [IMAGE], states(1), True)
     parse(right, 10)
     with pytest.raises(UserError, match=named):
         parse({**right, **change}, 10)
@@ -133,7 +133,7 @@ def test_a_wrong_value_is_named(change, named):
 
 @pytest.mark.parametrize("key", ["front_rgb_list", "wrist_rgb_list", "joint_state_list", "is_first_step"])
 def test_a_missing_key_is_named(key):
-    message = challenge([PICTURE], [PICTURE], states(1), True)
+    message = challenge([IMAGE], [IMAGE], states(1), True)
     del message[key]
     with pytest.raises(UserError, match=f"lacks {key}"):
         parse(message, 10)
@@ -142,7 +142,7 @@ def test_a_missing_key_is_named(key):
 @pytest.mark.parametrize(
     "message",
     [None, [], 3, {}, {"reset": False}, {"reset": "yes"}, {b"reset": True}, {"add_buffer": True},
-     {"add_buffer": False}, {"observation/image": PICTURE}],
+     {"add_buffer": False}, {"observation/image": IMAGE}],
 )  # fmt: skip
 def test_what_is_no_request_is_refused(message):
     with pytest.raises(UserError):
@@ -153,11 +153,11 @@ def test_a_false_flag_alone_is_told_what_to_send():
     with pytest.raises(UserError, match=r"reset=false: no request\. Send reset=true, or an observation"):
         parse({"reset": False}, 10)
     with pytest.raises(UserError, match="Did you mean 'observation/image'"):
-        parse({"reset": False, "observation_image": PICTURE}, 10)
+        parse({"reset": False, "observation_image": IMAGE}, 10)
 
 
 def test_false_flags_beside_an_observation_are_as_good_as_none():
-    sent = observation(PICTURE, PICTURE, states(1)[0], reset=False, add_buffer=False)
+    sent = observation(IMAGE, IMAGE, states(1)[0], reset=False, add_buffer=False)
     assert isinstance(parse(sent, 10), Infer)
     assert isinstance(parse({**sent, "reset": True}, 10), Reset)
     with pytest.raises(UserError, match="add_buffer must be true or false"):
@@ -166,8 +166,8 @@ def test_false_flags_beside_an_observation_are_as_good_as_none():
 
 @pytest.mark.parametrize("goal", ["\ud800", "pick \udfff up", None, 7, b"pick", [None], {"a": 1}, np.zeros(2)])
 def test_a_prompt_that_is_no_text_is_refused_in_words(goal):
-    for sent in (observation(PICTURE, PICTURE, states(1)[0], prompt=goal),
-                 challenge([PICTURE], [PICTURE], states(1), True, task_goal=goal)):  # fmt: skip
+    for sent in (observation(IMAGE, IMAGE, states(1)[0], prompt=goal),
+                 challenge([IMAGE], [IMAGE], states(1), True, task_goal=goal)):  # fmt: skip
         with pytest.raises(UserError, match=r"(prompt|task_goal) (must be a text|holds half of a surrogate pair)"):
             parse(sent, 10)
 

@@ -145,14 +145,14 @@ def test_a_body_has_a_time_limit_as_a_whole(policy, monkeypatch):
     monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.1)
     with Served(policy, limits=Limits(receive_s=1)) as served, slow_post(served) as raw:
         raw.settimeout(0.2)
-        answer = b""
+        output = b""
         for _ in range(100):  # a byte each 0.2 s: no pause reaches receive_s
             try:
-                answer += raw.recv(4096)
+                output += raw.recv(4096)
                 break
             except TimeoutError:
                 raw.sendall(b"x")
-        assert answer.startswith(b"HTTP/1.1 408")
+        assert output.startswith(b"HTTP/1.1 408")
 
 
 def test_silent_sessions_are_freed(policy):

@@ -15,7 +15,7 @@ from helpers.serving_fakes import Served, acted_directly, ask, challenge, course
 from mme_vla.errors import UserError
 from mme_vla.serving import Limits, connections, pack
 
-PICTURE = np.zeros((16, 16, 3), np.uint8)
+IMAGE = np.zeros((16, 16, 3), np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
 
 def test_a_lost_http_episode_is_not_gone_on_with(policy):
     first, later = (pack(challenge(*part, first=index == 0)) for index, part in enumerate(course()[:2]))
-    buffer = pack({"add_buffer": True, "images": PICTURE[None, None], "state": states(1)})
+    buffer = pack({"add_buffer": True, "images": IMAGE[None, None], "state": states(1)})
     with Served(policy, limits=Limits(connections=2)) as served:
         assert ask(served, "POST", "/infer", buffer, X_Session="a")[0] == 409, "it was never begun"
         assert ask(served, "POST", "/infer", first, X_Session="a")[0] == 200

@@ -81,6 +81,6 @@ def test_a_conversation_over_http(server: Server, caplog: pytest.LogCaptureFixtu
     assert (usage.calls, usage.retries, usage.input_tokens, usage.output_tokens) == (3, 2, 900, 300)
     first = server.requests[0]["contents"][0]["parts"]
     assert base64.b64decode(first[0]["inlineData"]["data"])[4:8] == b"ftyp" and "text" in first[2]
-    assert [turn["role"] for turn in server.requests[-1]["contents"]] == ["user", "model", "user"]
+    assert [rotation["role"] for rotation in server.requests[-1]["contents"]] == ["user", "model", "user"]
     assert "subgoal" in server.requests[0]["systemInstruction"]["parts"][0]["text"]
     assert SECRET not in caplog.text

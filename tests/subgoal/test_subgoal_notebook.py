@@ -114,8 +114,8 @@ class Model:
 @pytest.fixture
 def server() -> Iterator[ChatServer]:
     pytest.importorskip("openai", reason="needs the extra openai")
-    with chat_server() as found:
-        yield found
+    with chat_server() as match:
+        yield match
 
 
 def predictor_for(server: ChatServer | None, **options: Any) -> NotebookPredictor:

@@ -27,8 +27,8 @@ QUICK = {"backoff": 0, "requests_per_minute": None}
 @pytest.fixture
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[ChatServer]:
     monkeypatch.setenv("OPENAI_API_KEY", SECRET)
-    with chat_server() as found:
-        yield found
+    with chat_server() as match:
+        yield match
 
 
 def frames(count: int, first: int = 0) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_a_conversation_over_http(server: ChatServer, caplog: pytest.LogCaptureF
     assert set(server.keys) == {f"Bearer {SECRET}"} and SECRET not in caplog.text
     system, *messages = server.requests[-1]["messages"]
     assert system["role"] == "system" and "subgoal" in system["content"]
-    assert [turn["role"] for turn in messages] == ["user", "assistant", "user"]
+    assert [rotation["role"] for rotation in messages] == ["user", "assistant", "user"]
     assert isinstance(messages[1]["content"], str), "a model's own words go back as a text"
     assert "temperature" not in server.requests[0]
 
@@ -155,15 +155,15 @@ def test_an_answer_that_repeats_the_key_is_kept_without_it(
     server.answers = [failure(500, echo), says(None, refusal=echo), subgoal(f"press {echo}")]
     predictor = OpenAI(base_url=address, cache=str(tmp_path), retries=1, interval=16, **QUICK)
     episode = predictor.start_episode("press", None, "StopCube")
-    heard = []
+    received = []
     with caplog.at_level(logging.DEBUG):
         for _ in range(2):
             episode.observe(frames(16))
-            heard.append(predictor.predict([episode])[0])
-    kept = "".join(file.read_text() for file in tmp_path.rglob("*.json"))
-    for text in (caplog.text, repr(heard), kept):
+            received.append(predictor.predict([episode])[0])
+    retained = "".join(file.read_text() for file in tmp_path.rglob("*.json"))
+    for text in (caplog.text, repr(received), retained):
         assert not any(secret in text for secret in (SECRET, "ssword", login))
-    assert "press *** *** ***" in heard[1].reply and "press *** *** ***" in kept
+    assert "press *** *** ***" in received[1].reply and "press *** *** ***" in retained
     assert set(server.keys) == {f"Basic {login}"}, "as it is sent for an address with a password"
 
 

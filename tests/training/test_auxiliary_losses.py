@@ -70,8 +70,8 @@ def test_weight_zero_leaves_loss_and_gradients_bitwise_equal(policy: MMEPolicy) 
     batch = labelled(policy)
     loss, _ = loss_of(policy, batch, write=0.0)
     weighed = gradients(policy)
-    plain, metrics = loss_of(policy, replace(batch, history=replace(batch.history, labels=Labels())))
-    assert torch.equal(loss, plain)
+    base, metrics = loss_of(policy, replace(batch, history=replace(batch.history, labels=Labels())))
+    assert torch.equal(loss, base)
     assert "losses/write" not in metrics
     assert all(torch.equal(weighed[name], value) for name, value in gradients(policy).items())
 

@@ -37,9 +37,9 @@ def test_several_trainings_resume_and_share_a_cache(tmp_path: Path, monkeypatch:
     with pytest.raises(KeyboardInterrupt):
         command.main(compose("train", words))
     first = trainings_in(output)[0] / "summary.json"
-    written = first.stat().st_mtime_ns
+    stored = first.stat().st_mtime_ns
     command.main(compose("train", words))
-    assert calls == ["training_0", "training_1", "training_1"] and first.stat().st_mtime_ns == written
+    assert calls == ["training_0", "training_1", "training_1"] and first.stat().st_mtime_ns == stored
     policies = [MMEPolicy.from_pretrained(locate_checkpoint(run)) for run in trainings_in(output)]
     facts = [facts_of(policy, None, "one", RolloutSettings(), None).training for policy in policies]
     assert [one and one.seed for one in facts] == [42, 43] and len({one and one.recipe for one in facts}) == 1

@@ -40,8 +40,8 @@ def published(policy: MMEPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def same(one: MMEPolicy, other: MMEPolicy) -> bool:
-    mine, theirs = one.state_dict(), other.state_dict()
-    return set(mine) == set(theirs) and all(torch.equal(tensor, theirs[name]) for name, tensor in mine.items())
+    mine, reference = one.state_dict(), other.state_dict()
+    return set(mine) == set(reference) and all(torch.equal(tensor, reference[name]) for name, tensor in mine.items())
 
 
 @pytest.mark.parametrize("named", [lambda folder: folder, lambda folder: folder / "79999.zip"], ids=["folder", "zip"])

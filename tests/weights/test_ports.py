@@ -71,8 +71,8 @@ def empty_pi05(**overrides: Any) -> MMEPolicy:
 
 
 def same(one: MMEPolicy, other: MMEPolicy) -> bool:
-    mine, theirs = one.state_dict(), other.state_dict()
-    return set(mine) == set(theirs) and all(torch.equal(tensor, theirs[name]) for name, tensor in mine.items())
+    mine, reference = one.state_dict(), other.state_dict()
+    return set(mine) == set(reference) and all(torch.equal(tensor, reference[name]) for name, tensor in mine.items())
 
 
 @pytest.mark.parametrize("spelling", SPELLINGS)

@@ -37,8 +37,8 @@ def base(bases: dict[str, Path]) -> MMEPolicy:
 
 
 def equal(one: MMEPolicy, other: MMEPolicy) -> bool:
-    theirs = other.state_dict()
-    return all(torch.equal(tensor, theirs[name]) for name, tensor in one.state_dict().items())
+    reference = other.state_dict()
+    return all(torch.equal(tensor, reference[name]) for name, tensor in one.state_dict().items())
 
 
 @pytest.mark.parametrize("fmt", FORMATS)

@@ -55,10 +55,10 @@ def _demonstrated(environment: Environment, spec: EpisodeSpec, max_steps: int) -
     env = EpisodeEnv(environment, environment.make(spec), spec, max_steps)
     try:
         rows = []
-        for observation, action, shown in env.demonstration():
+        for observation, action, visible in env.demonstration():
             images = {f"{IMAGES}{name}": np.asarray(image) for name, image in observation.items() if name != "state"}
             state = np.asarray(observation["state"], np.float32)
-            numbers = {STATE: state, ACTION: np.asarray(action, np.float32), "is_demo": np.array([shown])}
+            numbers = {STATE: state, ACTION: np.asarray(action, np.float32), "is_demo": np.array([visible])}
             rows.append({**images, **numbers, "task": env.goal})
         return rows, env.success
     finally:

@@ -101,8 +101,8 @@ class Arm:
         random = np.random.default_rng(0)
         for _ in range(1 + _RESTARTS):
             arm = self._wrapped(self._iterate(target, start))
-            found = sapien.Pose(self.transform(arm))
-            if self.within_limits(arm) and pose_distance(found, sapien.Pose(target)) < IK_TOLERANCE:
+            match = sapien.Pose(self.transform(arm))
+            if self.within_limits(arm) and pose_distance(match, sapien.Pose(target)) < IK_TOLERANCE:
                 return arm
             start = self._padded(random.uniform(self.lower, self.upper))
         return None

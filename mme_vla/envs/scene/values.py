@@ -174,16 +174,16 @@ class Values:
         parts = name.split(".")
         if parts[0] == "initializations":
             entries = self.spec.setdefault("initializations", [{}])
-            entries[-1][parts[1]] = _plain(value)
+            entries[-1][parts[1]] = _to_json(value)
             return
         holder: Any = self.spec
         for part, following in itertools.pairwise(parts):
             holder = holder.setdefault(part, [] if following.isdigit() else {})
         if isinstance(holder, list):
             del holder[int(parts[-1]) :]
-            holder.append(_plain(value))
+            holder.append(_to_json(value))
         else:
-            holder[parts[-1]] = _plain(value)
+            holder[parts[-1]] = _to_json(value)
 
     def error(self, name: str, problem: str) -> UserError:
         """What is wrong with a value of the row."""
@@ -213,10 +213,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     """Numbers, texts, lists and dictionaries, as JSON keeps them to the last bit."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [_to_json(v) for v in value]
     return value

@@ -51,8 +51,8 @@ class BinFill(Task):
         )
         self.board = self.add(build_board(self, (BOARD_X + dx, y), math.radians(degrees)))
         numbers = values("objects.target_numbers", lambda: self._draw_counts(draws))
-        whole = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
-        if not whole or len(numbers) != len(COLOURS) or not any(numbers):
+        full = isinstance(numbers, list) and all(type(n) is int and n >= 0 for n in numbers)
+        if not full or len(numbers) != len(COLOURS) or not any(numbers):
             raise values.error("objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green")
         self.goal = Counter(dict(zip(COLOURS, numbers, strict=True)))
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}

@@ -69,8 +69,8 @@ class InsertPeg(Task):
         x, y = values.place("initializations.box_jitter", lambda: [-0.1 + 0.2 * draws.uniform() for _ in range(2)])
         yaw = values.number("initializations.box_yaw", lambda: math.radians(90 - 20 + 40 * draws.uniform()))
         self.box.set_home(at((x, y), APERTURE_Z, yaw))
-        for peg, (place, turn) in zip(self.pegs, self._read_pegs() or self._draw_pegs(draws, (x, y)), strict=True):
-            peg.set_home(at(place, 0, turn))
+        for peg, (place, rotation) in zip(self.pegs, self._read_pegs() or self._draw_pegs(draws, (x, y)), strict=True):
+            peg.set_home(at(place, 0, rotation))
         self.end: PegEnd = ENDS[values.integer("initializations.obj_sample", lambda: draws.integer(0, 2), most=1)]
         self.side = (-1, 1)[values.integer("initializations.dir_sample", lambda: draws.integer(0, 2), most=1)]
         below = self.box.position - [0, 0, Highlight.DEPTH]

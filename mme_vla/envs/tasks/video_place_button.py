@@ -38,9 +38,9 @@ class VideoPlaceButton(VideoPlace):
     def visits(self) -> list[SubTask]:
         before = [0, *self._extra["before"]]
         after = [1, *self._extra["after"]]
-        shown = [[step for i in part for step in (self.show_pick(), self.show_drop(self.targets[i]))]
+        visible = [[step for i in part for step in (self.show_pick(), self.show_drop(self.targets[i]))]
                  for part in (before, after)]  # fmt: skip
-        return [*shown[0], self.show_press(), *shown[1], *(self.put_back(self.cube) if self.tier else [])]
+        return [*visible[0], self.show_press(), *visible[1], *(self.put_back(self.cube) if self.tier else [])]
 
     def goals(self) -> list[str]:
         start = f"watch the video carefully, then place the {self.cube.colour} cube on the target"

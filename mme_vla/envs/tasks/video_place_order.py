@@ -30,13 +30,13 @@ class VideoPlaceOrder(VideoPlace):
         if rows != len(self.shown):
             raise values.error("objects.visit_ids_by_object", f"has {rows} lists for {len(self.shown)} cubes")
         visits = [values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)]
-        asked = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
+        requested = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
         total = sum(map(len, visits))
-        self.cube = self.cubes[self.shown[asked]]
+        self.cube = self.cubes[self.shown[requested]]
         self._visits = [
             (self.cubes[cube], [self.targets[i] for i in ids]) for cube, ids in zip(self.shown, visits, strict=True)
         ]
-        self.visited = self._visits[asked][1]
+        self.visited = self._visits[requested][1]
         count = len(self.visited)
         self.rank = values.integer("objects.which_in_subset", lambda: draws.integer(1, count + 1), least=1, most=count)
         self.press_after = values.integer(

@@ -91,9 +91,9 @@ def bootstrap(
     means = np.zeros(samples)
     for of_methods in tasks.values():
         n_episodes = len(of_methods[0])
-        drawn = rng.integers(0, n_episodes, (samples, n_episodes))
+        sampled = rng.integers(0, n_episodes, (samples, n_episodes))
         for values, share in zip(of_methods, shares, strict=True):
-            means += sum(values[:, i][drawn].mean(1) * share[:, i] for i in range(values.shape[1]))
+            means += sum(values[:, i][sampled].mean(1) * share[:, i] for i in range(values.shape[1]))
     tail = (1 - confidence) / 2
     low, high = np.quantile(means / len(tasks), [tail, 1 - tail])
     return Interval(float(low), float(high))
@@ -246,7 +246,7 @@ def aggregate(
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))
-    protocol = replace(protocol, own_suites={**suites_of(records), **protocol.own_suites})
+    protocol = replace(protocol, task_suites={**suites_of(records), **protocol.task_suites})
     merged = merge(records, conflicts)
     known = {*PAPER_ORDER, *(record.task for record in merged)}
     for task in protocol.tasks:
@@ -367,7 +367,7 @@ def _figure(
 ) -> Figure:
     """A figure over whole tasks, from the runs that have all of them."""
     per_run = [[pick(run, task) for task in tasks] for run in runs]
-    whole = [run for run, of_tasks in zip(runs, per_run, strict=True) if None not in of_tasks]
+    full = [run for run, of_tasks in zip(runs, per_run, strict=True) if None not in of_tasks]
     complete = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
     done = [record for run in runs for key, record in run.records.items() if key.task in tasks]
     counts = {
@@ -378,8 +378,8 @@ def _figure(
         partial = 100 * sum(record.success for record in done) / len(done) if done else None
         return Figure(None, None, None, **counts, partial=partial, paper=reported)
     matrices = [np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))]  # episodes × runs
-    place = {id(run): number for number, run in enumerate(whole)}
-    rows = [[place[id(run)] for run in members] for members in by_training(whole)]
+    place = {id(run): number for number, run in enumerate(full)}
+    rows = [[place[id(run)] for run in members] for members in by_training(full)]
     trainings = [np.stack([matrix[:, row].mean(1) for row in rows], 1) for matrix in matrices]  # episodes × trainings
     units = trainings if len(rows) > 1 else matrices
     mean, std = mean_std([float(np.mean([unit[:, r].mean() for unit in units])) for r in range(units[0].shape[1])])

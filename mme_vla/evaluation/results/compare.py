@@ -92,7 +92,7 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     means = 100 * np.mean([[side.mean() for side in sides] for sides in by_task.values()], axis=0)
     gaps = {task: first.mean(1) - second.mean(1) for task, (first, second) in by_task.items()}
     trained = any(len(method.trainings) > 1 for method in (first, second))
-    drawn = {task: [sides[0], -sides[1]] if trained else [gaps[task][:, None]] for task, sides in by_task.items()}
+    sampled = {task: [sides[0], -sides[1]] if trained else [gaps[task][:, None]] for task, sides in by_task.items()}
     everything = np.concatenate(list(gaps.values()))
     wins, losses = int((everything > 0).sum()), int((everything < 0).sum())
     p = sign_test(wins, losses)
@@ -102,11 +102,11 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
         if scope.kind == "suite" and inside:
             suites[scope.name] = (
                 100 * float(np.mean([gaps[task].mean() for task in inside])),
-                _interval({task: drawn[task] for task in inside}, protocol),
+                _interval({task: sampled[task] for task in inside}, protocol),
             )
     return Comparison(
         first.label, second.label, len(common), len(protocol.averaged) * protocol.episodes, float(means[0]),
-        float(means[1]), float(means[0] - means[1]), _interval(drawn, protocol), wins, losses, p, p,
+        float(means[1]), float(means[0] - means[1]), _interval(sampled, protocol), wins, losses, p, p,
         p < 1 - protocol.confidence, suites, first.repeated + second.repeated, first.flipped + second.flipped,
     )  # fmt: skip
 

@@ -135,13 +135,13 @@ def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
         pairs = _common(members, runs.get(twin, []))
         if not pairs:
             continue
-        plain, shown = (Share.of(side, confidence) for side in zip(*pairs, strict=True))
+        base, visible = (Share.of(side, confidence) for side in zip(*pairs, strict=True))
         better = sum(b.success and not a.success for a, b in pairs)
         worse = sum(a.success and not b.success for a, b in pairs)
         repeated, flipped = (sum(n) for n in zip(repeats.get(run, (0, 0)), repeats.get(twin, (0, 0)), strict=True))
         rows.append([
-            str(run), str(len(pairs)), f"{plain.rate:.1f} {plain.span}", f"{shown.rate:.1f} {shown.span}",
-            f"{shown.rate - plain.rate:+.1f}", f"{100 - shown.rate:.1f}", f"{better} : {worse}",
+            str(run), str(len(pairs)), f"{base.rate:.1f} {base.span}", f"{visible.rate:.1f} {visible.span}",
+            f"{visible.rate - base.rate:+.1f}", f"{100 - visible.rate:.1f}", f"{better} : {worse}",
             f"{flipped} of {repeated}" if repeated else "none run twice",
         ])  # fmt: skip
     columns = ["run", "episodes", "split (%)", "twin (%)", "lost by memory", "lost by control", "gained : lost",

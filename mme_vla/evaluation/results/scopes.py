@@ -83,7 +83,7 @@ class Protocol:
 
     tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are the benchmark's, of
         these: tasks of one's own have figures of their own, beside the average.
-    own_suites: task → suite, of environments that are not RoboMME (`suites_of`).
+    task_suites: task → suite, of environments that are not RoboMME (`suites_of`).
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation, or `missing`.
     confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
     """
@@ -94,7 +94,7 @@ class Protocol:
     confidence: float = 0.95
     samples: int = 10_000
     seed: int = 0
-    own_suites: Mapping[str, str] = field(default_factory=dict)
+    task_suites: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for holds, message in (
@@ -118,13 +118,13 @@ class Protocol:
     def suites(self) -> list[str]:
         """The suites that take part: RoboMME's, those of other environments, `OWN` last."""
         return [
-            suite for suite in (*SUITES, *dict.fromkeys(self.own_suites.values()), OWN) if self.choose("suite", suite)
+            suite for suite in (*SUITES, *dict.fromkeys(self.task_suites.values()), OWN) if self.choose("suite", suite)
         ]
 
     def facts(self, task: str) -> Task:
         """What is known of a task; of an environment's own it is the suite."""
         facts = task_facts(task)
-        return facts if task in TASK_FACTS else facts._replace(suite=self.own_suites.get(task, OWN))
+        return facts if task in TASK_FACTS else facts._replace(suite=self.task_suites.get(task, OWN))
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""

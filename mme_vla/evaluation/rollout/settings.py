@@ -56,8 +56,8 @@ class RolloutSettings:
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Read the keys of a configuration that are settings; others are ignored."""
-        given = {key: value for key, value in config.items() if (key, value) != ("max_steps", None)}
-        return read_section(cls, given, others=True)
+        provided = {key: value for key, value in config.items() if (key, value) != ("max_steps", None)}
+        return read_section(cls, provided, others=True)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""

@@ -19,7 +19,7 @@ from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, own_processor
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed import Recompute
@@ -92,7 +92,7 @@ class DiffusionPolicy(NetworkPolicy):
             grid = sizes.memory_tower.image_size // sizes.memory_tower.patch_size
             memory = build_memory(config["memory"], sizes.memory_width, grid, integration.memory_width)
             check_past(config, memory, frozenset())
-        processor = own_processor(DiffusionProcessor, processor, "dp, or dp_tiny to try things out")
+        processor = processor_for(DiffusionProcessor, processor, "dp, or dp_tiny to try things out")
         return cls(network, memory, integration, processor, config, **policy_options(cls, config))
 
     # Training

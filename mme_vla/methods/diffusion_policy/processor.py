@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_choice, check_whole, did_you_mean, missing_extra, require
+from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, missing_extra, require
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
 from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, Sample, SampleSpec, StatsSpec
@@ -136,18 +136,18 @@ class DiffusionProcessor(PolicyProcessor):
             memory_size: side of the images that a memory's vision tower reads.
         """
         check_choice("processor.frames", frames, FRAMES)
-        check_whole("processor.window", window, 64)
+        check_integer("processor.window", window, 64)
         require(
             text and isinstance(text, str), f"processor.text={brief(text)} must be clip, hashed, or a CLIP's folder."
         )
         height, width = picture
-        self.picture = (check_whole("processor.picture", height), check_whole("processor.picture", width))
+        self.picture = (check_integer("processor.picture", height), check_integer("processor.picture", width))
         self.embodiment = embodiment
-        width = check_whole("processor.text_dim", text_dim)
+        width = check_integer("processor.text_dim", text_dim)
         folder = CLIP if text == CLIP_NAME else text
         self.text_name, self.text = text, HashedWords(width) if text == HASHED else ClipText(width, folder)
         self.samples = SampleSpec(window=window, consecutive=frames == FRAMES[0])
-        self.memory_size = check_whole("processor.memory_size", memory_size)
+        self.memory_size = check_integer("processor.memory_size", memory_size)
         self.stats = stats
 
     @classmethod

@@ -22,7 +22,7 @@ from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, own_processor
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
@@ -88,7 +88,7 @@ class MemoryVlaPolicy(NetworkPolicy):
                 f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}: its own retrieval "
                 "reads a memory, in place of its banks. Set integration=none."
             )
-        processor = own_processor(MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it")
+        processor = processor_for(MemoryVlaProcessor, processor, "memoryvla, or memoryvla_tiny to try it")
         require(
             not (processor is not None and processor.samples.group_size == 1 and not config.get("memory")),
             "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "

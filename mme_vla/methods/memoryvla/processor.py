@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import check_whole, require
+from mme_vla.errors import check_integer, require
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles, OpenVlaProcessor
@@ -68,7 +68,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
         size = config.get("group_size", GROUP_SIZE)
-        check_whole("processor.group_size", size)
+        check_integer("processor.group_size", size)
         built = super().from_config({key: value for key, value in config.items() if key != "group_size"})
         built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
         return built

@@ -19,7 +19,7 @@ from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import NAME, KeyframeBatch, SAM2ActProcessor, cloud_images, zoomed_images
 from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import NetworkPolicy, own_processor
+from mme_vla.policy.network import NetworkPolicy, processor_for
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import POLICIES
 from mme_vla.speed import Recompute
@@ -200,7 +200,7 @@ class SAM2ActPolicy(NetworkPolicy):
             not config.get("memory") and not config.get("integration"),
             "SAM2Act+ has a memory of its own: set memory=none integration=none.",
         )
-        processor = own_processor(SAM2ActProcessor, processor, "sam2act_plus")
+        processor = processor_for(SAM2ActProcessor, processor, "sam2act_plus")
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
     @property

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_whole, missing_extra, require
+from mme_vla.errors import UserError, brief, check_integer, missing_extra, require
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
 from mme_vla.methods.sam2act.geometry import (
     EMPTY,
@@ -242,7 +242,7 @@ class SAM2ActProcessor(PolicyProcessor):
         sizes = {"language": language, "words": words, "side": side, "video_frames": video_frames}
         sizes |= {"trained_waypoints": trained_waypoints, "waypoints": waypoints}
         for name, value in sizes.items():
-            check_whole(f"processor.{name}", value, LARGEST)
+            check_integer(f"processor.{name}", value, LARGEST)
         numbers = list(bounds)
         finite = len(numbers) == 6 and all(isinstance(n, int | float) and np.isfinite(n) for n in numbers)
         require(

@@ -182,8 +182,8 @@ class OpenAISettings(Settings):
             f"video_frames={self.video_frames} must be an even number of images, 2 or more.",
         )
         if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
-            shown = self.base_url.rpartition("@")[2]  # without a password
-            raise UserError(f"base_url={shown!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
+            visible = self.base_url.rpartition("@")[2]  # without a password
+            raise UserError(f"base_url={visible!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
 
     @property
     def login(self) -> str:

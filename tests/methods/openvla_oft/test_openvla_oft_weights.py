@@ -30,8 +30,8 @@ def saved(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
 
 
 def equal(one: Policy, other: Policy) -> bool:
-    theirs = other.state_dict()
-    return all(torch.equal(value, theirs[name]) for name, value in one.state_dict().items())
+    reference = other.state_dict()
+    return all(torch.equal(value, reference[name]) for name, value in one.state_dict().items())
 
 
 def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) -> None:

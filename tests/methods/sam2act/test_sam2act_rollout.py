@@ -48,9 +48,9 @@ def make_motion_env(task: str, split: str, episode: int, max_steps: int, **optio
 
 @pytest.fixture(scope="module")
 def policy() -> SAM2ActPolicy:
-    found = build_policy("sam2act_plus")
-    assert isinstance(found, SAM2ActPolicy)
-    return found
+    match = build_policy("sam2act_plus")
+    assert isinstance(match, SAM2ActPolicy)
+    return match
 
 
 def test_every_waypoint_is_requested_once_and_counts_its_frames(policy: SAM2ActPolicy) -> None:

@@ -86,9 +86,9 @@ def test_every_tensor_has_a_unique_released_name(network: SAM2ActNetwork) -> Non
 
 @pytest.fixture(scope="module")
 def policy() -> SAM2ActPolicy:
-    found = build_policy("sam2act_plus")
-    assert isinstance(found, SAM2ActPolicy)
-    return found
+    match = build_policy("sam2act_plus")
+    assert isinstance(match, SAM2ActPolicy)
+    return match
 
 
 @pytest.fixture(scope="module")

@@ -49,10 +49,10 @@ def test_windows_and_timestamps() -> None:
     cases = read("sampling")
     for case in cases["windows"]:
         window = Window(case["seconds"], case["fps"], case["native_fps"], case["variable"])
-        shown = window.frames(case["current"])
+        visible = window.frames(case["current"])
         assert (window.length, window.stride) == (case["n_frames"], case["stride"])
-        assert shown.tolist() == case["frames"]
-        assert [timestamp(time) for time in window.times(len(shown))] == case["timestamps"]
+        assert visible.tolist() == case["frames"]
+        assert [timestamp(time) for time in window.times(len(visible))] == case["timestamps"]
     for case in cases["derive"]:
         window = Window(case["seconds"], case["fps"], case["native_fps"])
         assert [window.length, window.stride] == case["result"]
@@ -192,7 +192,7 @@ def _training_batch(policy: SimpleMemVlaPolicy) -> VideoBatch:
     golden, config, processor = arrays("training"), read("meta")["config"], policy.require_processor()
     views, anchors = frames(), golden["made/anchors"].tolist()
     items: list[dict[str, Any]] = []
-    for i, (anchor, answer) in enumerate(zip(anchors, read("meta")["sizes"]["answers"], strict=True)):
+    for i, (anchor, output) in enumerate(zip(anchors, read("meta")["sizes"]["answers"], strict=True)):
         video = processor.video(channels_first(views["front"][processor.frames(anchor)]))
         images = processor.images([views["wrist"][anchor]])
         request = processor.prompt(read("meta")["sizes"]["goal"])
@@ -201,7 +201,7 @@ def _training_batch(policy: SimpleMemVlaPolicy) -> VideoBatch:
         steps = torch.arange(anchor, anchor + config["action_horizon"])
         items.append(
             {
-                "tokens": processor.tokens(request, len(video), side, image_side, answer),
+                "tokens": processor.tokens(request, len(video), side, image_side, output),
                 "video": video,
                 "images": images,
                 "state": processor.states(golden["made/raw_states"][anchor]),
@@ -277,9 +277,9 @@ def test_decisions_from_images(policy: SimpleMemVlaPolicy) -> None:
         actions = torch.from_numpy(policy.act(episode))
         assert episode.subtask == case["said"]
         assert error(actions, golden[f"plain/{k}/actions"]) < TOLERANCE
-        said, condition = policy.generate(_with_features(policy, episode))
+        message, condition = policy.generate(_with_features(policy, episode))
         prompt = golden[f"plain/{k}/prompt_ids"].shape[1]
-        assert said[0] == golden[f"plain/{k}/full_ids"][0, prompt:].tolist()
+        assert message[0] == golden[f"plain/{k}/full_ids"][0, prompt:].tolist()
         assert error(condition.hidden, golden[f"plain/{k}/cond_hidden"]) < TOLERANCE
         assert condition.tokens is not None
         assert error(condition.tokens, golden[f"plain/{k}/cond_token"]) < TOLERANCE
@@ -322,12 +322,12 @@ def test_prompts_that_were_read_ahead(tmp_path: Path) -> None:
     golden, policy = arrays("stream"), golden_policy(tmp_path, variable=False)
     views, processor, robot = frames(), policy.require_processor(), policy.embodiment
     episode: Any = policy.start_episode(read("meta")["sizes"]["goal"])
-    seen, k = 0, 0
+    observed, k = 0, 0
     while f"{k}/frames" in golden:
         step = int(golden[f"{k}/frames"][-1])
-        states = golden[f"{k}/state"].numpy()[None].repeat(step + 1 - seen, 0)
-        episode.observe({name: view[seen : step + 1] for name, view in views.items()}, states)
-        seen = step + 1
+        states = golden[f"{k}/state"].numpy()[None].repeat(step + 1 - observed, 0)
+        episode.observe({name: view[observed : step + 1] for name, view in views.items()}, states)
+        observed = step + 1
         assert processor.frames(step).tolist() == golden[f"{k}/frames"].tolist()
         tokens: Tokens = policy._tokens(episode)
         np.testing.assert_array_equal(tokens.ids, golden[f"{k}/input_ids"][0])

@@ -66,13 +66,13 @@ def observe(episode: Any, views: dict[str, np.ndarray], states: np.ndarray, star
 def test_reading_ahead_changes_no_action() -> None:
     policy = small(processor={"max_words": 4, "seconds": 10})
     views, states = observations(200)
-    ahead, plain = (policy.start_episode("pick up the cube", seed=3) for _ in range(2))
-    seen = 0
+    ahead, base = (policy.start_episode("pick up the cube", seed=3) for _ in range(2))
+    observed = 0
     for step in (0, 16, 32, 120, 136, 152, 190):
-        for episode in (ahead, plain):
-            observe(episode, views, states, seen, step + 1)
-        seen = step + 1
-        np.testing.assert_allclose(policy.act(ahead), policy.act(plain), atol=1e-5)
+        for episode in (ahead, base):
+            observe(episode, views, states, observed, step + 1)
+        observed = step + 1
+        np.testing.assert_allclose(policy.act(ahead), policy.act(base), atol=1e-5)
         while policy.prepare(ahead):
             pass
         planned: Any = ahead
@@ -83,14 +83,14 @@ def test_an_interrupted_reading_ahead_is_continued_where_it_stopped(monkeypatch:
     monkeypatch.setattr("mme_vla.methods.simplememvla.episode.PIECE", 2)
     policy = small(processor={"max_words": 4, "seconds": 20})
     views, states = observations(200)
-    ahead, plain = (policy.start_episode("pick up the cube", seed=3) for _ in range(2))
-    for episode in (ahead, plain):
+    ahead, base = (policy.start_episode("pick up the cube", seed=3) for _ in range(2))
+    for episode in (ahead, base):
         observe(episode, views, states, 0, 171)
         policy.act(episode)
     assert policy.prepare(ahead)  # more remains
-    for episode in (ahead, plain):
+    for episode in (ahead, base):
         observe(episode, views, states, 171, 187)
-    np.testing.assert_allclose(policy.act(ahead), policy.act(plain), atol=1e-5)
+    np.testing.assert_allclose(policy.act(ahead), policy.act(base), atol=1e-5)
 
 
 def test_what_an_episode_keeps_does_not_grow_beyond_its_window() -> None:
@@ -98,15 +98,15 @@ def test_what_an_episode_keeps_does_not_grow_beyond_its_window() -> None:
     window = policy.require_processor().window
     views, states = observations(400)
     episode: Any = policy.start_episode("pick up the cube")
-    kept = []
+    retained = []
     for step in range(0, 400, 16):
         observe(episode, views, states, max(step - 15, 0), step + 1)
         policy.act(episode)
         while policy.prepare(episode):
             pass
-        kept.append((len(episode.video.frames), len(episode.video.patches)))
-    assert all(frames <= window.span + 1 for frames, _ in kept)
-    assert len({patches for _, patches in kept[-10:]}) == 1
+        retained.append((len(episode.video.frames), len(episode.video.patches)))
+    assert all(frames <= window.span + 1 for frames, _ in retained)
+    assert len({patches for _, patches in retained[-10:]}) == 1
 
 
 def test_a_full_window_that_moved_on_forgets_the_first_frame() -> None:

@@ -38,9 +38,9 @@ def test_the_hidden_states_of_words_decide_about_actions() -> None:
     tokens = policy.generate(batch)
     assert tokens.tokens.shape[:2] == batch.forced.shape
     other = MemoryTokens(tokens.tokens.flip(0, 1) + 1, tokens.mask)
-    own = policy.sample_actions(batch, noise, 2)
-    assert torch.equal(own, policy.sample_actions(batch, noise, 2, memory=tokens))
-    assert not torch.allclose(own, policy.sample_actions(batch, noise, 2, memory=other))
+    custom = policy.sample_actions(batch, noise, 2)
+    assert torch.equal(custom, policy.sample_actions(batch, noise, 2, memory=tokens))
+    assert not torch.allclose(custom, policy.sample_actions(batch, noise, 2, memory=other))
 
 
 def test_words_end_at_the_limit_or_before() -> None:

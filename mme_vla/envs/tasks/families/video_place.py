@@ -152,10 +152,10 @@ class VideoPlace(Task):
 
     def show_drop(self, target: Disc, cube: Cube | None = None) -> SubTask:
         """The video's dropping of a cube on a target."""
-        moved = cube or self.cube
+        shifted = cube or self.cube
         return SubTask(
             "drop the cube onto target",
-            done=lambda: dropped_onto(self, moved, target),
+            done=lambda: dropped_onto(self, shifted, target),
             run=lambda demo: demo.place_on(target),
             targets=[target],
             choice="b",
