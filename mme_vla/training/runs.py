@@ -153,7 +153,9 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
 
 def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration with what runs of earlier versions did not say, because there was no other choice."""
-    train = {f.name: f.default for f in fields(TrainSettings) if f.default is not MISSING and f.name != "seed"}
+    options = [f for f in fields(TrainSettings) if f.name != "seed"]
+    train = {f.name: f.default for f in options if f.default is not MISSING}
+    train |= {f.name: {} for f in options if f.default_factory is dict}
     data = {"history_transforms": [], **(config.get("data") or {})}
     learning = {"learning": {"history_transforms": [], **config["learning"]}} if config.get("learning") else {}
     if list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]:  # now the default

@@ -37,7 +37,7 @@ class BenchmarkEnvBuilder:
     ) -> None:
         if gui_render:
             raise UserError("gui_render=True: these environments open no window. Leave it out, and use render().")
-        check_names(env_id, "mme_vla", action_space, None, None)
+        check_names(env_id, action_space, None, None)
         self.env_id, self.dataset, self.action_space, self.max_steps = env_id, dataset, action_space, max_steps
         if override_metadata_path is None:
             self._episodes = metadata.episodes(env_id, dataset)
