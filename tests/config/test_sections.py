@@ -88,7 +88,8 @@ def test_commands_read_their_settings_with_it() -> None:
         TrainSettings.from_dict({"steps": 1, "batch_size": 1, "lr": 1, "kepe": {}})
     for wrong, message in (
         ({"render": "no"}, "render='no' must be true or false"), ({"workers": 0}, "workers=0"),
-        ({"max_steps": 1.5}, "max_steps=1.5"), ({"split": "tset"}, "tset"), ({"env": "robome"}, "Unknown environment 'robome'"),
+        ({"max_steps": 1.5}, "max_steps=1.5"), ({"split": "tset"}, "tset"),
+        ({"env": "robome"}, "Unknown environment 'robome'"),
         ({"video": "some"}, "video='some'"), ({"timeout_s": 0}, "timeout_s=0"), ({"draw": "need"}, "'needed'"),
         ({"env": "official", "render": False}, "env=official"),
     ):  # fmt: skip
