@@ -23,12 +23,11 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from mme_vla.integration.expert import MemoryExpert
 
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.integration.base import Integration
-from mme_vla.integration.context import Context
+from mme_vla.integration.context import Context, MemoryExpert
 from mme_vla.integration.modulator import Modulator
 from mme_vla.memory.base import MemoryModule, make_scorer
 from mme_vla.memory.framesamp import FrameSamp

@@ -8,7 +8,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.metadata import packages_distributions, requires
 from pathlib import Path
@@ -25,6 +25,7 @@ from mme_vla.evaluation.store import find_records, read_folders
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "tests" / "extras"
+LEROBOT_EXTRAS = ("dataset",)  # of which the library itself depends
 NEW = "uv sync --inexact --extra {}"
 
 
@@ -167,9 +168,25 @@ def is_installed(extra: str) -> bool:
     return all(package in modules() for package in needs()[extra])
 
 
+def with_dependencies(packages: Iterable[str]) -> set[str]:
+    """Installed packages, and all that these require."""
+    required: set[str] = set()
+    left = list(packages)
+    while left:
+        package = left.pop()
+        if package in required or package not in modules():
+            continue
+        required.add(package)
+        for requirement in map(Requirement, requires(package) or []):
+            extras = ("", *LEROBOT_EXTRAS) if package == "lerobot" else ("",)
+            if requirement.marker is None or any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+                left.append(canonicalize_name(requirement.name))
+    return required
+
+
 def hidden(extras: Sequence[str]) -> set[str]:
-    """Modules of the packages that only other extras name."""
-    present = set().union(*(needs()[extra] for extra in ("", *extras)))
+    """Modules of the packages that only other extras name, and that no present package requires."""
+    present = with_dependencies(set().union(*(needs()[extra] for extra in ("", *extras))))
     return {module for package in set().union(*needs().values()) - present for module in modules().get(package, ())}
 
 

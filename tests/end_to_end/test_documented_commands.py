@@ -31,7 +31,7 @@ EXAMPLES = {
     "add-a-memory.md": "last_frames", "add-a-backbone.md": "regression", "add-an-integration.md": "gist",
     "add-a-task.md": "two_buttons", "your-robot.md": "bimanual", "first-hour.md": "first_hour",
     "auxiliary-losses.md": "write_head", "cached-keys-and-values.md": "fifo", "notes.md": "scratchpad",
-    "environments.md": "blink",
+    "environments.md": "blink", "trajectories.md": "trajectories",
 }  # fmt: skip
 """The folder that the commands of a page are typed in; of other pages it is the repository's root."""
 NOT_RUN = {
@@ -44,6 +44,8 @@ NOT_RUN = {
     r"mme_vla\.nano( |$)": "trains for minutes or hours",
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/": "needs the records of an evaluation",
+    r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a driver that stands in for one",
+    r"python (dagger|grpo)\.py": "tests/evaluation/test_rollouts.py and test_dagger_example.py run it",
     r"mme_vla\.serve ": "serves until it is stopped",
     r"mme-vla harness ": "serves until it is stopped",
     r"mme-vla docs$": "opens a browser; tests/docs builds the site",
