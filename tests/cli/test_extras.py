@@ -107,7 +107,6 @@ NEED = [
     Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
     Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
     Case((), "mme_vla.train model=diffusion_policy output=run4", "baselines", 2),
-    Case((), "mme_vla.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
     Case((), "mme_vla.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
 ]
 

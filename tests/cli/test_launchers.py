@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import pytest
+from hydra.errors import MissingConfigException
 
 from helpers import commands
+from mme_vla.config.override_errors import ConfigTree
 
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="launchers: uv sync --inexact --extra sweep")
 pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="launchers: uv sync --inexact --extra sweep")
@@ -35,3 +37,9 @@ def test_ray_runs_every_job_of_a_sweep(tmp_path: Path) -> None:
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     assert [(tmp_path / seed / "table.md").is_file() for seed in ("7", "42")] == [True, True]
+
+
+def test_a_launcher_that_is_not_installed_names_its_extra() -> None:
+    missing = MissingConfigException("Could not find 'hydra/launcher/joblib'", missing_cfg_file="hydra/launcher/joblib")
+    explained = ConfigTree.explain(None, missing)  # type: ignore[arg-type]
+    assert "launcher=joblib" in explained and "extra `sweep`" in explained
