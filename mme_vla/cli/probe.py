@@ -27,6 +27,7 @@ def main(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.envs.base import environment
     from mme_vla.evaluation.rollout.evaluation import choose_shard, facts_of
+    from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.offline import OfflineSettings
     from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
@@ -40,7 +41,8 @@ def main(cfg: DictConfig) -> None:
         raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
     if values["offline"] and values["recordings"] is None:
         raise UserError(NO_DATA)
-    settings = RolloutSettings.from_config(values)
+    events = event_arms(values["event"])
+    settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
     jobs = _jobs(values, settings) if values["online"] else []
     shard = choose_shard(values["shard"])
@@ -57,7 +59,7 @@ def main(cfg: DictConfig) -> None:
     folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events, shard, source)
     try:
         report = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals)
     finally:
