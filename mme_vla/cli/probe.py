@@ -10,7 +10,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import Job
@@ -30,7 +30,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.offline import OfflineSettings
-    from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
+    from mme_vla.probing.run import IN_CLOSED_LOOP, NO_DATA, ProbePlan, run_probe
     from mme_vla.utils import safe_name
 
     values = resolved(cfg)
@@ -42,6 +42,7 @@ def main(cfg: DictConfig) -> None:
     if values["offline"] and values["recordings"] is None:
         raise UserError(NO_DATA)
     events = event_arms(values["event"])
+    require(values["online"] or not events, IN_CLOSED_LOOP)
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
     jobs = _jobs(values, settings) if values["online"] else []

@@ -12,7 +12,7 @@ from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.api import load
 from mme_vla.evaluation.recordings import Recording, all_recordings
 from mme_vla.evaluation.records import EpisodeRecord
@@ -39,6 +39,9 @@ NO_DATA = (
     "`mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false online=true "
     "probes in closed loop alone."
 )
+
+
+IN_CLOSED_LOOP = "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,8 @@ def probe(
     run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
     if recordings is None and tasks is None:
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
+    arms_of_events = event_arms(event)
+    require(tasks is not None or not arms_of_events, IN_CLOSED_LOOP)
     loaded, source = load(policy)
     recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
@@ -195,7 +200,7 @@ def probe(
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
-    plan = ProbePlan(arms, recorded, recorded, jobs, offline, event_arms(event), source=source)
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, arms_of_events, source=source)
     folder = Path(output).expanduser()
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress

@@ -58,7 +58,7 @@ def test_without_positions_there_is_no_position_layer_and_a_narrower_encoder() -
     }  # fmt: skip
     sizes = [sum(p.numel() for p in encoder.parameters()) for encoder in (full, none)]
     assert sizes[0] - sizes[1] == 768 * 1024 + 768 * 768 + 768
-    with pytest.raises(UserError, match="memory.positions='time'"):
+    with pytest.raises(UserError, match=r"memory\.positions='time'"):
         build("framesamp", positions="time")
 
 
