@@ -20,10 +20,16 @@ WITH_POSITIONS: dict[str, dict[str, Any]] = {
     "learned_topk": {"budget": 32, "pool": 8, "grid": 4}, "moment": {}, "actions": {"budget": 4},
 }  # fmt: skip
 
+OTHERS: dict[str, dict[str, Any]] = {
+    "bank": {"budget": 16, "grid": 4}, "spacetime": {"frames": 3},
+    "joined": {"members": [{"name": "framesamp", "budget": 32}, {"name": "actions", "budget": 4}]},
+}  # fmt: skip
+
 
 def build(name: str, **options: Any) -> Memory:
     torch.manual_seed(0)
-    memory: Memory = MEMORIES.build({"name": name, **WITH_POSITIONS[name], **options}, d_vision=D_VISION, width=WIDTH)
+    section = {"name": name, **(WITH_POSITIONS | OTHERS)[name], **options}
+    memory: Memory = MEMORIES.build(section, d_vision=D_VISION, width=WIDTH)
     return memory.eval()
 
 
@@ -63,7 +69,7 @@ def test_without_positions_there_is_no_position_layer_and_a_narrower_encoder() -
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", WITH_POSITIONS)
+@pytest.mark.parametrize("name", WITH_POSITIONS | OTHERS)
 def test_every_memory_learns_from_a_repeated_frame(name: str) -> None:
     memory, run = build(name), 16
     frames = map_frames([RepeatFrame(run, 4)], 48, Episode.exec_start, keep=[47])
