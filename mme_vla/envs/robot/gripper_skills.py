@@ -36,7 +36,10 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
         first = second
     across = axes[first] * (1 if closing @ axes[first] >= 0 else -1)
     across = across - (across @ DOWN) * DOWN
-    return pointing_down(np.cross(across, DOWN))
+    across /= np.linalg.norm(across)
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([np.cross(across, DOWN), across, DOWN], axis=1)
+    return sapien.Pose(frame).q
 
 
 def pointing_down(forward: np.ndarray) -> np.ndarray:
