@@ -60,7 +60,7 @@ def main(cfg: DictConfig) -> None:
     folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
     try:
         report = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals)
     finally:

@@ -49,8 +49,8 @@ class ProbePlan:
     """What is probed.
 
     arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
-    jobs: episodes of the closed loop, none for none. events: further arms of it, in the simulation.
-    source: where the weights are from.
+    jobs: episodes of the closed loop, none for none. source: where the weights are from.
+    events: further arms of the closed loop, in the simulation.
     """
 
     arms: Any = None
@@ -58,9 +58,9 @@ class ProbePlan:
     lend: Sequence[Recording] = ()
     jobs: Sequence[Job] = ()
     offline: OfflineSettings = field(default_factory=OfflineSettings)
-    events: Sequence[str] = ()
     shard: Shard = field(default_factory=Shard)
     source: str | None = None
+    events: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def probe(
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
-    plan = ProbePlan(arms, recorded, recorded, jobs, offline, arms_of_events, source=source)
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)
     folder = Path(output).expanduser()
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress

@@ -129,6 +129,14 @@ def test_frames_of_a_gap_are_not_observed(policy: MMEPolicy, monkeypatch: pytest
         assert torch.allclose(selection.features, offline.features, atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["framesamp_modul", "tokendrop_expert"])
+def test_images_on_demand_are_all_that_a_policy_reads_under_events(name: str) -> None:
+    policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
+    event = "pause:5@step:16+gap:4@step:16+speed:2"
+    few, every = (roll(policy, [UNMASK], InlineEnvs(), event=event, draw=draw)[0] for draw in ("needed", "all"))
+    assert facts(few) == facts(every) and few.steps == 51
+
+
 def test_a_video_can_be_faster_or_slower(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
     for event, length in (("speed:2", 10), ("speed:0.5", 42)):
         seen = Seen(policy, monkeypatch)
