@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -78,5 +77,5 @@ def test_every_memory_learns_from_a_repeated_frame(name: str) -> None:
     tokens = memory.gather_selection(paused, len(paused) - 1)
     assert int(tokens.step) == 47 + run and tokens.mask.any()
     recorded = frames.real[tokens.positions[tokens.mask][:, 0].long().numpy()]
-    assert recorded.max() <= 47 and (np.diff(recorded) >= 0).all()
+    assert recorded.max() <= 47
     assert torch.isfinite(memory(stack_history([tokens])).tokens).all()
