@@ -210,7 +210,7 @@ class Rail(gymnasium.Env[Any, Any]):
         return self._frame(), 0.0, False, False, {}
 
     def _frame(self) -> dict[str, np.ndarray]:
-        return {"front": np.full((8, 8, 3), self.time, np.uint8), "state": np.float32([self.place])}
+        return {"front": np.full((8, 8, 3), self.time, np.uint8), "state": np.array([self.place], np.float32)}
 
 
 class Rails(Environment):

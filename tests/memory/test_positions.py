@@ -75,7 +75,7 @@ def test_every_memory_learns_from_a_repeated_frame(name: str) -> None:
     base = Episode(memory, 48).cached()
     paused = TransformedHistory(base, frames)
     tokens = memory.gather_selection(paused, len(paused) - 1)
-    assert int(tokens.step) == 47 + run and tokens.mask.any()
+    assert tokens.step is not None and int(tokens.step) == 47 + run and tokens.mask.any()
     recorded = frames.real[tokens.positions[tokens.mask][:, 0].long().numpy()]
     assert recorded.max() <= 47
     assert torch.isfinite(memory(stack_history([tokens])).tokens).all()
