@@ -187,15 +187,18 @@ def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
         EventCourse(read_events("pause:1@subtask:1")).next(Any, step=0, subtask=0)  # type: ignore[arg-type]
 
 
-def test_an_event_of_your_own_is_registered_by_name(memoryless: MMEPolicy) -> None:
+def test_an_event_of_your_own_is_registered_by_name(policy: MMEPolicy) -> None:
     @register("event", "rename")
     class Rename(Event):
+        hold, observed = 8, 5
+
         def act(self, episode: Any) -> None:
             episode.goal = "do something else"
 
     assert EVENTS["rename"] is Rename
-    (record,) = roll(memoryless, [UNMASK], InlineEnvs(), event="rename@step:20")
-    assert record.extra["goal"] == "do something else" and record.extra["events"][0]["step"] == 32
+    few, every = (roll(policy, [UNMASK], InlineEnvs(), event="rename@step:10", draw=d)[0] for d in ("needed", "all"))
+    assert few.extra["goal"] == "do something else" and few.extra["events"][0]["step"] == 16
+    assert facts(few) == facts(every) and few.steps == 49
 
 
 class Rail(gymnasium.Env[Any, Any]):
