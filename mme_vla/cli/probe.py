@@ -10,7 +10,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import Job
@@ -27,9 +27,10 @@ def main(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.envs.base import environment
     from mme_vla.evaluation.rollout.evaluation import choose_shard, facts_of
+    from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.offline import OfflineSettings
-    from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
+    from mme_vla.probing.run import IN_CLOSED_LOOP, NO_DATA, ProbePlan, run_probe
     from mme_vla.utils import safe_name
 
     values = resolved(cfg)
@@ -40,7 +41,9 @@ def main(cfg: DictConfig) -> None:
         raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
     if values["offline"] and values["recordings"] is None:
         raise UserError(NO_DATA)
-    settings = RolloutSettings.from_config(values)
+    events = event_arms(values["event"])
+    require(values["online"] or not events, IN_CLOSED_LOOP)
+    settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
     jobs = _jobs(values, settings) if values["online"] else []
     shard = choose_shard(values["shard"])
@@ -57,7 +60,7 @@ def main(cfg: DictConfig) -> None:
     folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
     try:
         report = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals)
     finally:
