@@ -339,10 +339,12 @@ class UnmaskSwap(Task):
         groups = PARKED if self.tier else dict.fromkeys(PARKED)
         nearest = [Swap(thing, inner, start + i * steps, steps=steps) for i, thing in enumerate(self.initiators)]
         swaps = nearest if self.pairs is None else planned_swaps(self.pairs, inner, start, steps)
-        self.shown = [Cover(inner, groups["inner"]), *swaps]
+        cover = Cover(inner, groups["inner"])
+        self.shown = [cover, *swaps]
         self.motions: list[Cover | Swap | Hide] = [
-            *self.shown,
+            cover,
             Cover(outer, groups["outer"]),
+            *swaps,
             *planned_swaps(self.outer_pairs, outer, start, steps),
             Hide(list(zip(self.cubes, self.over_cubes, strict=True)), start, end, groups["inner cubes"]),
             Hide(self.outer.hidden, start, end, groups["outer cubes"]),
