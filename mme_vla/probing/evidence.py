@@ -56,10 +56,11 @@ def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -
 
     def take(step: "RecordedStep") -> None:
         nonlocal video
-        frame = len(states)
+        frame, subtasks = len(states), env.progress.subtasks
         for i in range(len(ended), env.progress.index):
             ended[i] = frame
-        recent = {i: env.progress.subtasks[i] for i, at in ended.items() if frame - at < KEY_POSE}
+        in_video = step.info["is_video_demo"]  # the arm is elsewhere once the execution begins
+        recent = {i: subtasks[i] for i, at in ended.items() if frame - at < KEY_POSE and subtasks[i].video <= in_video}
         for fact in env.evidence(recent):
             facts.setdefault(fact, []).append(frame)
         if step.info["is_subgoal_boundary"]:
@@ -67,7 +68,7 @@ def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -
         states.append(benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]))
         if "front_rgb" in step.obs:
             images[frame] = step.obs["front_rgb"]
-        video += step.info["is_video_demo"]
+        video += in_video
 
     try:
         request = RenderRequest({"front": rendered}, now=(), grounded=False)

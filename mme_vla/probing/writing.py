@@ -3,7 +3,7 @@
 Nothing is trained and no policy acts: the memory selects along demonstrated episodes (`evidence.py`).
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import comb
 from typing import TYPE_CHECKING, Any
@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from mme_vla.data.statistics import normalised_states
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule, frames_scored, make_scorer, stack_history
 from mme_vla.memory.history import CachedHistory, FrameScores, History
 from mme_vla.probing.evidence import EvidenceEpisode
-from mme_vla.processing.normalise import QuantileStats, normalize
+from mme_vla.processing.normalise import normalize
 
 if TYPE_CHECKING:
     from mme_vla.policy.mme import MMEPolicy
@@ -207,12 +208,12 @@ def required_frames(memory: MemoryModule) -> frozenset[int]:
 
 
 def memory_selection(
-    memory: MemoryModule, episode: EvidenceEpisode, stats: QuantileStats, policy: "MMEPolicy | None" = None
+    memory: MemoryModule, episode: EvidenceEpisode, states: torch.Tensor, policy: "MMEPolicy | None" = None
 ) -> Selection:
     """What a memory keeps along an episode.
 
     Args:
-        stats: normalise the robot's states. policy: makes the tokens; None where the memory reads none to choose.
+        states: of the robot, normalised [t, s]. policy: makes the tokens; None where the memory reads none to choose.
     """
     stored, scorer = memory.storage.stored_frames(episode.length), make_scorer(memory)
     rows = {} if scorer is None else {t: scorer(t, episode.images[t]) for t in sorted(episode.images)}
@@ -225,8 +226,7 @@ def memory_selection(
     else:
         tokens = policy.encode_frames(np.stack([episode.images[t] for t in stored.tolist()])).float()
         history = CachedHistory(context[0], tokens.cpu().numpy(), *context[1:])
-    motion = normalize(torch.from_numpy(episode.states), stats)
-    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
+    history.motion, history.state_width = states.__getitem__, states.shape[1]
     return lambda step: kept_frames(memory, history, step)
 
 
@@ -250,24 +250,22 @@ def score_writing(
         UserError: the memory keeps no frames, or reads tokens and there is no policy.
     """
     writing = Writing()
-    stats = state_statistics(episodes) if policy is None else policy.require_processor().require_stats().state
+    raw = np.concatenate([episode.states for episode in episodes])
+    if policy is None:
+        normalised = normalised_states(raw)
+    else:
+        normalised = normalize(torch.from_numpy(raw), policy.require_processor().require_stats().state)
+    states = normalised.split([episode.length for episode in episodes])
     tower = policy if isinstance(selector, MemoryModule) and reads_tokens(selector) else None
-    for episode in episodes:
+    for episode, motion in zip(episodes, states, strict=True):
         if isinstance(selector, str):
             kept = REFERENCES[selector](episode)
         else:
-            kept = memory_selection(selector, episode, stats, tower)
+            kept = memory_selection(selector, episode, motion, tower)
         score = score_episode(kept, episode.facts, episode.length, episode.exec_start, stride)
         if score is not None:
             writing.tasks.setdefault(episode.task, []).append(score)
     return writing
-
-
-def state_statistics(episodes: Iterable[EvidenceEpisode]) -> QuantileStats:
-    """Quantiles of the states of some episodes, each number [8]."""
-    states = np.concatenate([episode.states for episode in episodes]).astype(np.float64)
-    low, high = np.quantile(states, (0.01, 0.99), axis=0)
-    return QuantileStats(states.mean(0), states.std(0), low, high)
 
 
 def writing_table(results: Mapping[str, Writing]) -> str:

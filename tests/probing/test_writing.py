@@ -107,7 +107,7 @@ def test_the_score_separates_evidence_from_chance_on_every_task(task: str) -> No
     assert episode is not None and episode.facts
     assert len(episode.facts) <= FRAMES, "the oracle has a place for each fact"
     oracle, chance = (score_writing(name, [episode]).to_dict()["mean"]["score"] for name in ("oracle", "random"))
-    assert oracle >= 0.95 and chance < 0.8
+    assert oracle >= 0.95 and chance < oracle - 0.1
 
 
 @pytest.mark.slow
