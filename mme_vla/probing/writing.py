@@ -176,12 +176,12 @@ def kept_frames(memory: MemoryModule, history: History, step: int) -> np.ndarray
     Raises:
         UserError: memory tokens belong to no frame, as a recurrent memory's.
     """
-    if memory.capacity <= memory.budget:
-        return np.unique(memory.select(history, step)[:, 0])
     if not memory.timed:
         raise UserError(
             f"{type(memory).__name__} makes a state of all frames that it reads and keeps none: score one that selects."
         )
+    if memory.capacity <= memory.budget:
+        return np.unique(memory.select(history, step)[:, 0])
     tokens = memory(stack_history([memory.gather_selection(history, step)]))
     ages = tokens.ages[tokens.mask].cpu().numpy()
     return np.unique(step - ages[ages == ages.round()].astype(np.int64))
