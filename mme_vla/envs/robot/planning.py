@@ -44,8 +44,8 @@ def plan_screw(
 
     Args:
         arm: the kinematic model.
-        qpos: present joint angles, [7] or longer. The path keeps their precision, as that of `mplib` does: single in the
-            official demonstrations of the gripper, double in those of the stick.
+        qpos: present joint angles, [7] or longer. The path keeps their precision, as in `mplib`: single in official
+            demonstrations of the gripper, double in those of the stick.
         target_pose: of the tool centre point in the world.
         velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
