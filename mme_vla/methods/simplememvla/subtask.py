@@ -19,6 +19,7 @@ from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
 from mme_vla.methods.simplememvla.prompt import clean_response
+from mme_vla.model import weighted_mean
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import Sample
@@ -155,7 +156,10 @@ class SubtaskPolicy(MMEPolicy):
         return torch.cat([block.tokens for block in blocks], 1), torch.cat([block.mask for block in blocks], 1)
 
     def forward(self, batch: Batch, *args: Any, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        """The action's loss under the recorded words, and the weighted cross entropy of these."""
+        """The action's loss under the recorded words, and the weighted cross entropy of these.
+
+        Each word's counts as much as its sample (`Batch.weight`).
+        """
         if not isinstance(batch, SubtaskBatch) or batch.words is None or batch.words_mask is None:
             raise ValueError("forward() computes a loss: the batch must hold the words of its sub-tasks.")
         if batch.words.shape[1] > self.subtask.longest + 1:
@@ -166,8 +170,10 @@ class SubtaskPolicy(MMEPolicy):
         with self.autocast():
             hidden = self.subtask.hidden(*self._context(batch), batch.words)
             logits = self.subtask.logits(hidden[:, :-1])
-        words = functional.cross_entropy(logits[batch.words_mask], batch.words[batch.words_mask])
-        memory = MemoryTokens(hidden[:, 1:], batch.words_mask)
+        mask = batch.words_mask
+        losses = functional.cross_entropy(logits[mask], batch.words[mask], reduction="none")
+        words = weighted_mean(losses, None if batch.weight is None else batch.weight[mask.nonzero()[:, 0]])
+        memory = MemoryTokens(hidden[:, 1:], mask)
         action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
         loss = action + self.subtask_weight * words
         return loss, {**metrics, "loss": loss.detach(), "action": action.detach(), "words": words.detach()}
