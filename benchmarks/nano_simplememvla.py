@@ -35,9 +35,12 @@ from mme_vla.training.settings import TrainSettings
 
 TASK, LEVEL, FIRST_SEED = "SwingXtimes", "easy", 3_000_000
 HELD_OUT = 10  # one demonstration in so many only measures the loss
-WORDS = ("model=simplememvla", "backbone=simplememvla_nano", "embodiment=robomme_choice_front", "embodiment.action.horizon=4",
-         "embodiment.action.execute=1", "policy.augment=false", "train=nano", "+train.schedule=cosine", "train.lr=1e-3",
-         "train.log_every=25", "train.val_every=100", "train.val_samples=48", "train.save_every=100")  # fmt: skip
+WORDS = (
+    "model=simplememvla", "backbone=simplememvla_nano", "embodiment=robomme_choice_front",
+    "embodiment.action.horizon=4", "embodiment.action.execute=1", "policy.augment=false", "train=nano",
+    "+train.schedule=cosine", "train.lr=1e-3", "train.log_every=25", "train.val_every=100", "train.val_samples=48",
+    "train.save_every=100",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("overrides", nargs="*", help="train.steps=400 …")
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()
     files = record(args.folder, args.count)
     if args.command == "train":
         video = f"processor.video={'false' if args.no_video else 'true'}"
