@@ -150,6 +150,10 @@ def join(batches: Sequence[Batch]) -> Batch:
             `action_mask`, `options`) it becomes ones instead.
     """
     require(batches, "There are no rows to join.")
+    require(
+        all(batch is not None for batch in batches),
+        "None has no rows to join: leave out trajectories that an error ended before their first decision.",
+    )
     require(len({tuple(batch.labels) for batch in batches}) == 1, "The batches to join have different labels.")
     length, joined = max(batch.prompt.shape[1] for batch in batches), {}
     for name in (member.name for member in fields(Batch)):

@@ -18,6 +18,7 @@ from mme_vla.config.composition import compose
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.video import TEMPORAL
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.testing.small import unit_stats
 from mme_vla.training.optim import lr_factors, make_optimizer
@@ -209,6 +210,24 @@ def test_lora_trains_adapters_of_the_language_model_and_the_head() -> None:
     loss, _ = policy.train()(batch)
     loss.backward()
     assert all(p.grad is not None for name, p in policy.named_parameters() if p.requires_grad and "lora_B" in name)
+
+
+@pytest.mark.slow
+def test_a_lora_training_lowers_the_loss_and_changes_adapted_layers_and_the_head_alone(tmp_path: Path) -> None:
+    words = [*WORDS, *RUN, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
+             "train.warmup=2"]  # fmt: skip
+    trained = Policy.from_pretrained(run("simplememvla", tmp_path / "run", *words, short=[]))
+    values = losses(tmp_path / "run")
+    assert len(values) == 30 and np.mean(values[-5:]) < 0.9 * np.mean(values[:5])
+    fresh = dict(build_from_config(compose("train", ["model=simplememvla", *words])).named_parameters())
+    changed = {name for name, value in trained.named_parameters() if not torch.equal(value, fresh[name])}
+    assert any(name.startswith("action_head.") for name in changed) and any("q_proj" in name for name in changed)
+    targets = SimpleMemVlaPolicy.finetune_spec.lora_targets
+    others = {name for name in changed if not name.startswith("action_head.")}
+    assert all(name.removesuffix(".weight").endswith(targets) for name in others)
+    episode = trained.start_episode("pick up the cube", seed=1)
+    observe(episode, *observations(20), 0, 20)
+    assert np.isfinite(trained.act(episode)).all()
 
 
 def test_the_recipe_has_two_learning_rates() -> None:
