@@ -3,6 +3,7 @@
 python benchmarks/nano_simplememvla.py record --folder data/swing --count 70
 python benchmarks/nano_simplememvla.py train --folder data/swing --output outputs/video
 python benchmarks/nano_simplememvla.py train --folder data/swing --output outputs/no_video --no-video
+python benchmarks/nano_simplememvla.py measure --folder data/swing --output outputs/video/checkpoints/step_000300
 
 Frames are rendered only at decisions and where the video shows them. `mme-vla evaluate checkpoint=…` evaluates.
 """
@@ -25,6 +26,7 @@ from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.video import Window
 from mme_vla.nano.demonstrations import Demonstration, Scene
 from mme_vla.nano.learning import statistics
+from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
 from mme_vla.processing.base import Sample
 from mme_vla.training.logging import ProgressLine, open_loggers
@@ -32,6 +34,7 @@ from mme_vla.training.loop import Trainer
 from mme_vla.training.order import Validation
 from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
+from mme_vla.types import stack_noise
 
 TASK, LEVEL, FIRST_SEED = "SwingXtimes", "easy", 3_000_000
 HELD_OUT = 10  # one demonstration in so many only measures the loss
@@ -106,17 +109,41 @@ def train(files: Sequence[Path], output: Path, words: Sequence[str]) -> None:
         loggers.close()
 
 
+@torch.no_grad()
+def measure(files: Sequence[Path], checkpoint: Path) -> None:
+    """Print how many held-out decisions have the right option, and how far their points are off."""
+    policy: Any = Policy.from_pretrained(str(checkpoint)).eval()
+    processor, robot = policy.require_processor(), policy.embodiment.action
+    items, rights, distances = decisions(policy, files[HELD_OUT - 1 :: HELD_OUT]), [], []
+    for start in range(0, len(items), 16):
+        batch = processor.collate(items[start : start + 16])
+        generator = torch.Generator().manual_seed(0)
+        noise = stack_noise([policy.sampling_noise(generator) for _ in batch.prompts])
+        made, meant = (
+            processor.absolute_actions(chunk, batch.state)[:, 0]
+            for chunk in (policy.sample_actions(batch, noise), batch.actions)
+        )
+        right = made[:, list(robot.choice)].argmax(1) == meant[:, list(robot.choice)].argmax(1)
+        rights += right.tolist()
+        distances += (made - meant)[:, list(robot.point)].norm(dim=1).tolist()
+    print(f"right option in {sum(rights)} of {len(rights)} decisions; points off by a median of "
+          f"{np.median(distances):.3f} of the image's side")  # fmt: skip
+    print("".join("x" if right else "." for right in rights))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("command", choices=("record", "train"))
+    parser.add_argument("command", choices=("record", "train", "measure"))
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--count", type=int, default=70)
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--output", type=Path, help="of train: a run folder; of measure: a checkpoint")
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("overrides", nargs="*", help="train.steps=400 …")
     args = parser.parse_intermixed_args()
     files = record(args.folder, args.count)
-    if args.command == "train":
+    if args.command == "measure":
+        measure(files, args.output)
+    elif args.command == "train":
         video = f"processor.video={'false' if args.no_video else 'true'}"
         train(files, args.output, [video, "train.steps=400", "train.batch_size=16", *args.overrides])
 

@@ -155,7 +155,8 @@ def join(batches: Sequence[Batch]) -> Batch:
         "None has no rows to join: leave out trajectories that an error ended before their first decision.",
     )
     require(len({tuple(batch.labels) for batch in batches}) == 1, "The batches to join have different labels.")
-    length, joined = max(batch.prompt.shape[1] for batch in batches), {}
+    length = max(batch.prompt.shape[1] for batch in batches)
+    joined: dict[str, Any] = {}
     for name in (member.name for member in fields(Batch)):
         values = [getattr(batch, name) for batch in batches]
         known = [value for value in values if value is not None]
@@ -315,7 +316,7 @@ class _Collector(Rollout):
             job,
             record.outcome,
             record.steps,
-            torch.stack([d.chunk for d in decisions]) if decisions else self._no_chunks(),
+            torch.stack([d.chunk for d in decisions]) if decisions else torch.zeros(0, *self._chunk_shape),
             tuple(d.actions for d in decisions),
             join(executed) if "observations" in keep and rows else None,
             torch.tensor([d.reward for d in decisions]) if "rewards" in keep else None,
@@ -325,8 +326,9 @@ class _Collector(Rollout):
             record.error,
         )
 
-    def _no_chunks(self) -> Tensor:
-        return torch.zeros(0, self.policy.horizon, self.policy.embodiment.action.width)
+    @property
+    def _chunk_shape(self) -> tuple[int, int]:
+        return self.policy.horizon, self.policy.action_dim
 
     def _labelled(self, row: Batch, state: Tensor, actions: np.ndarray) -> Batch:
         """A row with these actions [n, w] in the network's units, repeated to a chunk, of which they alone count."""

@@ -212,6 +212,13 @@ def test_lora_trains_adapters_of_the_language_model_and_the_head() -> None:
     assert all(p.grad is not None for name, p in policy.named_parameters() if p.requires_grad and "lora_B" in name)
 
 
+def test_a_language_model_without_delta_nets_generates() -> None:
+    policy = small(**{"backbone.vlm.text_config.full_attention_interval": 1})
+    episode = policy.start_episode("pick up the cube", seed=1)
+    observe(episode, *observations(20), 0, 20)
+    assert np.isfinite(policy.act(episode)).all()
+
+
 @pytest.mark.slow
 def test_a_lora_training_lowers_the_loss_and_changes_adapted_layers_and_the_head_alone(tmp_path: Path) -> None:
     words = [*WORDS, *RUN, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
