@@ -220,18 +220,18 @@ def test_a_language_model_without_delta_nets_generates() -> None:
 
 
 @pytest.mark.slow
-def test_a_lora_training_lowers_the_loss_and_changes_adapted_layers_and_the_head_alone(tmp_path: Path) -> None:
+def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone(tmp_path: Path) -> None:
     words = [*WORDS, *RUN, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
              "train.warmup=2"]  # fmt: skip
     trained = Policy.from_pretrained(run("simplememvla", tmp_path / "run", *words, short=[]))
     values = losses(tmp_path / "run")
-    assert len(values) == 30 and np.mean(values[-5:]) < 0.9 * np.mean(values[:5])
+    assert len(values) == 30 and np.mean(values[-10:]) < 0.95 * np.mean(values[:10])
     fresh = dict(build_from_config(compose("train", ["model=simplememvla", *words])).named_parameters())
-    changed = {name for name, value in trained.named_parameters() if not torch.equal(value, fresh[name])}
-    assert any(name.startswith("action_head.") for name in changed) and any("q_proj" in name for name in changed)
-    targets = SimpleMemVlaPolicy.finetune_spec.lora_targets
-    others = {name for name in changed if not name.startswith("action_head.")}
-    assert all(name.removesuffix(".weight").endswith(targets) for name in others)
+    weights = {name.replace(".base_layer.", "."): value for name, value in trained.named_parameters()}
+    adapters = {name for name in weights if ".lora_" in name}
+    assert adapters and all(weights[name].any() for name in adapters)
+    changed = {name for name in fresh if not torch.equal(weights[name], fresh[name])}
+    assert changed and all(name.startswith("action_head.") for name in changed)
     episode = trained.start_episode("pick up the cube", seed=1)
     observe(episode, *observations(20), 0, 20)
     assert np.isfinite(trained.act(episode)).all()
