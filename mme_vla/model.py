@@ -234,5 +234,5 @@ def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = 
 
 
 def weighted_mean(losses: Tensor, weight: Tensor | None) -> Tensor:
-    """The mean of losses [n], of samples or of words, each times its weight [n]; None weighs all with 1."""
+    """The mean over a batch of each sample's loss [b] times its weight [b]; None weighs all with 1."""
     return losses.mean() if weight is None else (losses * weight).mean()

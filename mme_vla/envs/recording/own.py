@@ -47,7 +47,7 @@ def record_own(
                     failures.append(spec)
                 else:
                     with write_atomically(path) as temporary, temporary.open("wb") as file:
-                        np.savez_compressed(file, **columns)
+                        np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
         for path in filter(Path.is_file, episodes):
             with np.load(path) as loaded:

@@ -19,7 +19,6 @@ from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
 from mme_vla.methods.simplememvla.prompt import clean_response
-from mme_vla.model import weighted_mean
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import Sample
@@ -99,7 +98,9 @@ class SubtaskDecoder(nn.Module):
         words = torch.cat([self.begin.expand(len(ids), -1, -1), self.words(ids)], 1)
         words = words + self.places[:, : words.shape[1]]
         causal = torch.ones(words.shape[1], words.shape[1], dtype=torch.bool, device=ids.device).triu(1)
-        states: Tensor = self.layers(words, self.context(context), tgt_mask=causal, memory_key_padding_mask=~mask)
+        states: Tensor = self.layers(
+            words, self.context(context), tgt_mask=causal, memory_key_padding_mask=~mask, tgt_is_causal=True
+        )
         return states
 
     def logits(self, hidden: Tensor) -> Tensor:
@@ -171,8 +172,8 @@ class SubtaskPolicy(MMEPolicy):
             hidden = self.subtask.hidden(*self._context(batch), batch.words)
             logits = self.subtask.logits(hidden[:, :-1])
         mask = batch.words_mask
-        losses = functional.cross_entropy(logits[mask], batch.words[mask], reduction="none")
-        words = weighted_mean(losses, None if batch.weight is None else batch.weight[mask.nonzero()[:, 0]])
+        losses = functional.cross_entropy(logits.transpose(1, 2), batch.words, reduction="none") * mask
+        words = (losses if batch.weight is None else losses * batch.weight[:, None]).sum() / mask.sum()
         memory = MemoryTokens(hidden[:, 1:], mask)
         action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
         loss = action + self.subtask_weight * words
