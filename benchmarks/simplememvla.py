@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 
 from mme_vla import build_policy
 from mme_vla.evaluation.analyses.cost import flops, on_meta
@@ -70,9 +70,17 @@ def count() -> None:
 def update_flops(policy: Any, batch: Any, freeze_vision: bool) -> int:
     """FLOPs of the forward and the backward pass of one sample, without recomputation."""
     apply_finetuning(policy, freeze_vision=freeze_vision)
-    with FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(
+        display=False, custom_mapping={torch.ops.aten.convolution_backward: _conv_gradients}
+    ) as counter:
         policy(batch)[0].backward()
     return counter.get_total_flops()
+
+
+def _conv_gradients(made: Any, x: Any, weight: Any, *options: Any, **_: Any) -> int:
+    """FLOPs of a convolution's gradients, from shapes. PyTorch's own count of a grouped one is for a dense one."""
+    transposed, needed = options[4], options[-1]
+    return sum(needed[:2]) * conv_flop_count(x, weight, made, transposed)
 
 
 def memory(what: str, recompute: bool, cudnn: bool) -> None:
