@@ -224,7 +224,7 @@ def run(cfg: "DictConfig") -> None:
         jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5)
     )
     places = ", ".join(map(str, recording_plan.places))
-    work = Path(cfg.output).with_name(Path(cfg.output).name + ".recording")
+    work = _work_folder(cfg.output)
     if not recording_plan.missing(options) and not work.exists():
         print(f"{places}: {len(jobs)} episodes, all there already.")
         if cfg.coverage is not None:
@@ -233,7 +233,7 @@ def run(cfg: "DictConfig") -> None:
         return
     require_simulator()
     with FolderLock(work, "recording"):
-        _claim(work, jobs)
+        _claim(work, [job.plan for job in jobs])
         missing = recording_plan.missing(options)  # asked again: another process may have finished it meanwhile
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
@@ -260,7 +260,12 @@ def record_environment(cfg: "DictConfig") -> None:
     source = environment(cfg.env)
     source.check_installed()
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split, cfg.env)
-    frames, failures = record_own(source, specs, Path(cfg.output), cfg.fps)
+    output, work = Path(cfg.output), _work_folder(cfg.output)
+    require(not output.exists(), f"{output} exists already; choose another output, or remove it yourself.")
+    with FolderLock(work, "recording"):
+        _claim(work, [{"env": cfg.env, "fps": cfg.fps}, *map(vars, specs)])
+        frames, failures = record_own(source, specs, output, work, cfg.fps)
+        drop_plan(work)
     print(f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did not succeed.")
 
 
@@ -274,10 +279,14 @@ def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
     )
 
 
-def _claim(work: Path, jobs: Sequence[Job]) -> None:
+def _work_folder(output: str) -> Path:
+    return Path(output).with_name(Path(output).name + ".recording")
+
+
+def _claim(work: Path, plan: list[dict[str, Any]]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
     require(
-        claim_plan(work, [job.plan for job in jobs]),
+        claim_plan(work, plan),
         f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
         "another output, or remove that folder yourself.",
     )

@@ -97,7 +97,7 @@ class ProgressLine:
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True)
         self._total = total
         self._bar: Progress | None = None
-        if self.console.is_terminal and visible:
+        if self.console.is_terminal and self.console.file.isatty() and visible:
             columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
             self._bar = Progress(*columns, console=self.console, transient=True)
             self._task = self._bar.add_task("starting", total=total, completed=done)
