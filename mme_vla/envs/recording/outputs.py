@@ -1,6 +1,7 @@
-"""The outputs of a recording: a LeRobot dataset, official files, or both."""
+"""The outputs of a recording: a LeRobot dataset, official files, or both; of a user's own environment a dataset."""
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,10 +10,13 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.envs.base import Environment, EpisodeEnv
+from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.errors import require
+from mme_vla.errors import UserError, require
 from mme_vla.utils import read_json, remove_drafts, write_atomically
 
 if TYPE_CHECKING:
@@ -222,3 +226,69 @@ class RecordingPlan:
                 for job, e in zip(self.jobs, entries, strict=True)
             )
         )
+
+
+STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
+
+
+def record_own(
+    environment: Environment, specs: Sequence[EpisodeSpec], output: Path, fps: int = 20, max_steps: int = 1300
+) -> tuple[int, list[EpisodeSpec]]:
+    """Demonstrate episodes into a new dataset; those that do not succeed are left out.
+
+    The columns are `observation.images.<camera>`, `observation.state`, `action`, and `is_demo` for the frames of a
+    conditioning video. `output` appears when it is whole.
+
+    Returns:
+        Frames, and the episodes that did not succeed.
+    """
+    require(not output.exists(), f"{output} exists already; choose another output, or remove it yourself.")
+    draft = output.with_name(output.name + ".recording")
+    shutil.rmtree(draft, ignore_errors=True)
+    dataset: Any = None
+    failures, frames = [], 0
+    with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
+        for spec in specs:
+            rows, success = _demonstrated(environment, spec, max_steps)
+            if not success:
+                failures.append(spec)
+            else:
+                dataset = dataset or _create(rows[0], draft, fps)
+                for row in rows:
+                    dataset.add_frame(row)
+                dataset.save_episode()
+                frames += len(rows)
+            advance(1)
+    if dataset is None:
+        raise UserError(f"None of {len(specs)} demonstrations ended with info['success']: nothing was written.")
+    dataset.finalize()
+    draft.rename(output)
+    return frames, failures
+
+
+def _demonstrated(environment: Environment, spec: EpisodeSpec, max_steps: int) -> tuple[list[dict[str, Any]], bool]:
+    """Rows of an episode, and whether it succeeded."""
+    env = EpisodeEnv(environment, environment.make(spec), spec, max_steps)
+    try:
+        rows = []
+        for observation, action, visible in env.demonstration():
+            images = {f"{IMAGES}{name}": np.asarray(image) for name, image in observation.items() if name != "state"}
+            state = np.asarray(observation["state"], np.float32)
+            numbers = {STATE: state, ACTION: np.asarray(action, np.float32), "is_demo": np.array([visible])}
+            rows.append({**images, **numbers, "task": env.goal})
+        return rows, env.success
+    finally:
+        env.close()
+
+
+def _create(row: dict[str, Any], root: Path, fps: int) -> Any:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features: dict[str, Any] = {"is_demo": {"dtype": "bool", "shape": (1,), "names": None}}
+    for name, value in row.items():
+        if name.startswith(IMAGES):
+            features[name] = {"dtype": "image", "shape": value.shape, "names": ["height", "width", "channel"]}
+        elif name in (STATE, ACTION):
+            names = [f"{name.rpartition('.')[2]} {i}" for i in range(len(value))]
+            features[name] = {"dtype": "float32", "shape": value.shape, "names": names}
+    return LeRobotDataset.create(f"local/{root.name}", fps=fps, features=features, root=root, use_videos=False)

@@ -4,12 +4,7 @@ from typing import TYPE_CHECKING
 
 from mme_vla.envs.scene.motions import SWAP_STEPS, Cue, Swap, planned_swaps, row, sequential_swaps, tally, under
 from mme_vla.envs.scene.objects import COLOURS, RGB, Cube
-from mme_vla.envs.scene.placement import (
-    ANCHOR_HALF,
-    Draws,
-    Region,
-    rotated_anchors,
-)
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Draws, Region, rotated_anchors
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, pressed
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task

@@ -5,24 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Cue, Hide, Swap, planned_swaps, under
-from mme_vla.envs.scene.objects import (
-    COLOURS,
-    CONTAINER_OUTER,
-    Container,
-    Cube,
-    H,
-    build_container,
-    build_hidden_cube,
-)
-from mme_vla.envs.scene.placement import (
-    ANCHOR_HALF,
-    Avoid,
-    Draws,
-    Point,
-    Region,
-    SceneError,
-    draw_container,
-)
+from mme_vla.envs.scene.objects import COLOURS, CONTAINER_OUTER, Container, Cube, H, build_container, build_hidden_cube
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Avoid, Draws, Point, Region, SceneError, draw_container
 from mme_vla.envs.scene.predicates import container_picked_up, container_put_down
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
