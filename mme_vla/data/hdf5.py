@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -254,11 +254,8 @@ class RawEpisode:
         shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
         arrays: dict[str, np.ndarray] = {"colours": colours}
         for name, shape in shapes.items():
-            values = self._checked(
-                parts[name],
-                lambda x, shape=shape: x.size == math.prod(shape) and bool(np.isfinite(x).all()),
-                f"{list(shape)} finite numbers",
-            )
+            valid = partial(_is_finite_array, size=math.prod(shape))
+            values = self._checked(parts[name], valid, f"{list(shape)} finite numbers")
             arrays[name] = values.reshape(shape).astype(np.float32 if name == "depth" else np.float64)
         return arrays
 
@@ -293,6 +290,10 @@ class RawEpisode:
                 is_demo=k < self.exec_start,
                 subgoals=subgoals,
             )
+
+
+def _is_finite_array(array: np.ndarray, size: int) -> bool:
+    return array.size == size and bool(np.isfinite(array).all())
 
 
 def _decode(value: bytes | str) -> str:
