@@ -40,8 +40,8 @@ def plan_screw(
 
     Args:
         arm: the kinematic model.
-        qpos: present joint angles, [7] or longer. The path is kept in their precision, as `mplib` keeps it: the official
-            gripper demonstrations have single precision, those of the stick double.
+        qpos: present joint angles, [7] or longer. The path keeps their precision, as `mplib` does: the official gripper
+            demonstrations have single precision, those of the stick double.
         target_pose: of the tool centre point in the world.
         velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
