@@ -55,13 +55,7 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     from mme_vla.evaluation.feed import with_sessions
     from mme_vla.evaluation.recordings import all_recordings
     from mme_vla.evaluation.results.report import policy_facts
-    from mme_vla.evaluation.rollout.evaluation import (
-        choose_episodes,
-        choose_shard,
-        default_output,
-        evaluate,
-        facts_of,
-    )
+    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, default_output, evaluate, facts_of
     from mme_vla.evaluation.rollout.settings import RolloutSettings
 
     values = resolved(cfg)
