@@ -18,6 +18,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.recording.own import record_own
 from mme_vla.envs.rows import task_options
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError, require
@@ -181,7 +182,10 @@ def plan(cfg: "DictConfig") -> list[Job]:
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    frames = _frame_choice(cfg)
+    at, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
+    beside = "frames=all draws every frame, those of a memory too: leave out memory, or set frames."
+    require(at != "all" or memory is None, beside)
+    frames = None if at == "all" else FrameChoice(at, memory)
     return [
         Job(
             s.task,
@@ -195,16 +199,6 @@ def plan(cfg: "DictConfig") -> list[Job]:
         )
         for s in specs
     ]
-
-
-def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
-    frames: Any
-    memory: Any
-    frames, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
-    if frames == "all":
-        require(memory is None, "frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
-        return None
-    return FrameChoice(frames, memory)
 
 
 def run(cfg: "DictConfig") -> None:
@@ -255,8 +249,6 @@ def run(cfg: "DictConfig") -> None:
 
 def record_environment(cfg: "DictConfig") -> None:
     """Record demonstrations of an environment of the user's own."""
-    from mme_vla.envs.recording.own import record_own
-
     source = environment(cfg.env)
     source.check_installed()
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split, cfg.env)

@@ -31,11 +31,7 @@ logging.getLogger("toppra").setLevel(logging.ERROR)
 
 
 def plan_screw(
-    arm: Arm,
-    qpos: np.ndarray,
-    target_pose: sapien.Pose,
-    velocity_limit: float = 0.9,
-    acceleration_limit: float = 0.9,
+    arm: Arm, qpos: np.ndarray, target_pose: sapien.Pose, velocity_limit: float = 0.9, acceleration_limit: float = 0.9
 ) -> np.ndarray | None:
     """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
 
