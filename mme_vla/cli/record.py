@@ -182,7 +182,8 @@ def plan(cfg: "DictConfig") -> list[Job]:
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    at, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
+    values: Any = OmegaConf.to_container(cfg)
+    at, memory = (values[key] for key in KEYS)
     beside = "frames=all draws every frame, those of a memory too: leave out memory, or set frames."
     require(at != "all" or memory is None, beside)
     frames = None if at == "all" else FrameChoice(at, memory)

@@ -100,7 +100,7 @@ def score_episode(
     if not rows:
         return None
     lags = (held - first)[held >= 0].tolist()
-    precision, recall, chance_precision, chance_recall = np.mean(rows, axis=0).tolist()
+    precision, recall, chance_precision, chance_recall = np.mean(np.asarray(rows), axis=0).tolist()
     return EpisodeWriting(precision, recall, chance_precision, chance_recall, lags, len(facts))
 
 
