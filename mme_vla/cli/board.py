@@ -5,11 +5,12 @@ Words of `mme-vla nano` train and evaluate a row first, as far as it is not ther
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
+from mme_vla.config.composition import compose
 from mme_vla.errors import printable
 
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
@@ -20,8 +21,11 @@ EXAMPLES = (
 )  # fmt: skip
 
 
-def main(words: Sequence[str]) -> None:
-    """Train where a model is named, read the rows, print and write the board."""
+def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable[[Sequence[str]], list[str]]) -> None:
+    """Train where a model is named, read the rows, print and write the board.
+
+    nano: `mme-vla nano`, with the words of `sys.argv`. with_settings: these words with what they imply.
+    """
     parser = argument_parser("mme-vla nano board", __doc__, EXAMPLES)
     parser.add_argument("words", nargs="*", metavar="KEY=VALUE",
                         help="rows=FOLDER: rows of your own, repeatable; others: of mme-vla nano")  # fmt: skip
@@ -29,18 +33,33 @@ def main(words: Sequence[str]) -> None:
     parser.add_argument("--html", type=Path, help="write the board as one page with sortable tables and plots")
     parser.add_argument("--samples", type=int, help="of the bootstrap")
     with print_user_errors():
-        run(parser.parse_intermixed_args(words))
+        args = parser.parse_intermixed_args(words)
+        words = [word for word in args.words if not word.startswith("rows=")]
+        trees = [args.config_dir] if args.config_dir else []
+        config = compose("nano", with_settings(words), extra_dirs=trees)
+        trained = []
+        if any(word.startswith("model=") for word in words):
+            sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
+            nano()
+            trained.append(Path(config.output) / config.split)
+        run(args, str(config.split), trained)
 
 
-def run(args: argparse.Namespace) -> None:
-    """Do what the parsed command line says."""
+def alone(words: Sequence[str]) -> list[str]:
+    """Words for the models that they name and no other rows, with one training each if they do not say otherwise."""
+    typed = {word.partition("=")[0] for word in words}
+    others = ("beside=[]", "planner=false", "floors=false", "trainings=1")
+    return [*words, *(word for word in others if word.partition("=")[0] not in typed)]
+
+
+def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
+    """Read the rows, print the board, and write it where a file is named. trained: folders beside those of `rows=`."""
     from mme_vla.evaluation.results.tables import comparison_table, print_table
     from mme_vla.nano import board_page
     from mme_vla.nano.board import SAMPLES, Board
     from mme_vla.nano.rows import read_rows
 
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
-    split, trained = train_row([word for word in args.words if not word.startswith("rows=")], args.config_dir)
     rows = read_rows([SHIPPED / split] if (SHIPPED / split).is_dir() else [], own=[*folders, *trained])
     board = Board(rows, samples=args.samples or SAMPLES)
     pairs = board.neighbours()
@@ -53,18 +72,3 @@ def run(args: argparse.Namespace) -> None:
         args.html.parent.mkdir(parents=True, exist_ok=True)
         args.html.write_text(board_page.page(board), encoding="utf-8")
         print(f"wrote {args.html}")
-
-
-def train_row(words: Sequence[str], config_dir: Path | None) -> tuple[str, list[Path]]:
-    """Run `mme-vla nano` with these words where they name a model; the split, and the folders of rows it made."""
-    from mme_vla.cli import nano
-    from mme_vla.config.composition import compose
-
-    if not any(word.startswith("model=") for word in words):
-        return str(compose("nano", nano.with_settings(words)).split), []
-    alone = [word for word in ("beside=[]", "references=[]") if not any(w.startswith(word[:-2]) for w in words)]
-    words = [*words, *alone]
-    config = compose("nano", nano.with_settings(words), extra_dirs=[config_dir] if config_dir else [])
-    sys.argv[1:] = [*(["--config-dir", str(config_dir)] if config_dir else []), *words]
-    nano.main()
-    return str(config.split), [Path(config.output) / config.split]

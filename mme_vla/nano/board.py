@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from mme_vla.errors import did_you_mean, require
+from mme_vla.errors import require
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, holm, percentiles, resampled_means
 from mme_vla.evaluation.results.compare import Comparison, compare, compare_all
@@ -24,6 +24,8 @@ SAMPLES = 2000
 PERMUTATIONS = 9999
 MATCHED = "present_modul"
 """The floor with as many parameters as policies with memory, and tokens of the current frame alone."""
+FLOORS = ("pi05", MATCHED)
+"""The rows without memory that are trained as policies are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,11 @@ class Row:
     facts: Trained
     method: Method
     is_own: bool = False
+
+    @property
+    def kind(self) -> str:
+        """A `policy` with memory, a `floor` or a `ceiling`."""
+        return "floor" if self.name.partition(" ")[0] in FLOORS else self.facts.kind
 
     @property
     def average(self) -> Figure:
@@ -121,20 +128,14 @@ class Board:
         made = [_row(name, trainings, self.protocol) for name, trainings in rows.items()]
         self.rows = sorted(made, key=lambda row: -self.success(row))
 
-    def row(self, name: str) -> Row:
-        """Find a row."""
-        rows = {row.name: row for row in self.rows}
-        require(name in rows, f"There is no row {name!r}. {did_you_mean(name, rows)}")
-        return rows[name]
-
     def of_kind(self, kind: str) -> list[Row]:
         """The rows that are a `policy`, a `floor` or a `ceiling`."""
-        return [row for row in self.rows if row.facts.kind == kind]
+        return [row for row in self.rows if row.kind == kind]
 
     @property
     def ranked(self) -> list[Row]:
         """The rows that have a place: all but ceilings."""
-        return [row for row in self.rows if row.facts.kind != "ceiling"]
+        return [row for row in self.rows if row.kind != "ceiling"]
 
     def success(self, row: Row, tasks: Sequence[str] = ()) -> float:
         """A row's success over tasks, by default all, in percent."""
@@ -176,7 +177,7 @@ class Board:
         pairs = list(pairwise(ranked))
         if own := [row for row in ranked if row.is_own]:
             pairs = [pair for pair in pairs if pair[0].is_own or pair[1].is_own]
-            floors = [row for row in ranked if row.facts.kind == "floor" and row.facts.trained]
+            floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
             pairs += [(other, row) for row in own for other in (ranked[0], *floors) if other is not row]
         unique = {frozenset(row.name for row in pair): pair for pair in pairs}
         return compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)

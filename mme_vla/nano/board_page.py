@@ -144,7 +144,7 @@ def success_figure(board: Board) -> str:
     with figure((7.2, 0.26 * len(rows) + 1.0)) as (canvas, (axes,)):
         for at, row in enumerate(rows):
             low, high = row.average.interval or (0, 0)
-            mean, colour = board.success(row), OWN if row.is_own else PAINT[row.facts.kind]
+            mean, colour = board.success(row), OWN if row.is_own else PAINT[row.kind]
             axes.plot([low, high], [at, at], color=colour, lw=1.6)
             axes.plot(mean, at, "o", color=colour, ms=6)
             axes.plot(row.mean(board.protocol.tasks), np.full(len(row.method.trainings), at), "|", color=INK, ms=7)
@@ -185,7 +185,7 @@ def published_figure(board: Board) -> str:
     with figure((5.6, 3.9)) as (canvas, (axes,)):
         for row, method in board.published:
             x, y = published_success(method, board.protocol.tasks), board.success(row)
-            axes.plot(x, y, "o", color=PAINT[row.facts.kind], ms=5)
+            axes.plot(x, y, "o", color=PAINT[row.kind], ms=5)
             axes.annotate(row.name, (x, y), (4, 3), textcoords="offset points", fontsize=7)
         axes.set_xlabel("published success (%)")
         axes.set_ylabel("success here (%)")

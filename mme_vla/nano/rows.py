@@ -59,11 +59,15 @@ class Trained:
 
 @dataclass(frozen=True)
 class Training:
-    """One training and its episodes, numbered from 0 within each task. is_own: whether it is the user's."""
+    """One training and its episodes, numbered from 0 within each task.
+
+    rules: limits of an episode. is_own: whether it is the user's.
+    """
 
     folder: Path
     facts: Trained
     records: Sequence[EpisodeRecord]
+    rules: str
     is_own: bool = False
 
     @property
@@ -91,6 +95,11 @@ def read_rows(folders: Iterable[Path], own: Iterable[Path] = ()) -> dict[str, li
         if row:
             _check_alike(row[0], training)
         row.append(training)
+        require(
+            training.rules == trainings[0].rules,
+            f"{training.folder} has {training.rules}, but {trainings[0].folder} {trainings[0].rules}. Rows of one "
+            "board have the same.",
+        )
         scenes, expected = training.scenes, trainings[0].scenes
         if scenes != expected:
             differing = sorted({key for key in scenes | expected if scenes.get(key) != expected.get(key)})
@@ -135,7 +144,10 @@ def read_training(folder: Path) -> Training:
     counts = Counter(record.key for record in records)
     twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
-    return Training(folder, facts, _numbered(folder, records))
+    settings = run["settings"]
+    n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
+    rules = f"max_choices={n_choices}, only_possible={possible}"
+    return Training(folder, facts, _numbered(folder, records), rules)
 
 
 def _ended(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:

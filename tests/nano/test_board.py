@@ -3,62 +3,26 @@
 import json
 import lzma
 import re
-from collections.abc import Mapping
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from scipy.stats import kendalltau, spearmanr
 
+from helpers.nano_rows import SCENES, SPLIT, TASKS, records_of, write_records, write_training
 from mme_vla import UserError
+from mme_vla.cli import board as board_command
+from mme_vla.cli import nano as nano_command
 from mme_vla.envs.metadata import episodes
-from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import claim_run, read_folders
 from mme_vla.nano import board_page
-from mme_vla.nano.board import Board, homogeneity, kendall, pooled, spearman
+from mme_vla.nano.board import Board, Row, homogeneity, kendall, pooled, spearman
 from mme_vla.nano.rows import read_rows, read_training
-from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import write_json
-
-TASKS = ("BinFill", "VideoUnmask", "VideoRepick", "MoveCube")
-SPLIT, SCENES = "further", 3
-
-
-def write_training(
-    root: Path, row: str, seed: int, won: Mapping[str, int] | int, kind: str = "policy", **facts: Any
-) -> Path:
-    """A folder of a training that solves the first so many scenes of each task."""
-    folder = root / row / str(seed)
-    model, trained = row.partition("@")[0], facts.pop("trained", True)
-    budget = int(row.partition("@")[2] or 32)
-    identity = {"recipe": "r", "data": "d", "weights": f"{row}{seed}"} if trained else {}
-    config = {"name": model, "backbone": {"name": "nano"}, "memory": {"name": model, "budget": budget}}
-    settings = {"model": model, "checkpoint": 100, "seed": 7, "split": SPLIT, "max_steps": 500}
-    claim_run(folder, settings)
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    costs = {"parameters": 1_419_194, "update_flops": 1.2e10, "update_s": 0.13, "cpu_minutes": 7.0, "budget": budget}
-    write_json(folder / "trained.json",
-               {"row": row, "kind": kind, "trained": trained, "seed": seed, **identity, **costs, **facts})  # fmt: skip
-    records = []
-    for task in TASKS:
-        count = won if isinstance(won, int) else won.get(task, 0)
-        for spec in episodes(task, SPLIT)[:SCENES]:
-            outcome = "success" if spec.episode < count else "fail"
-            records.append(EpisodeRecord(
-                model, 100, 7, task, spec.episode, spec.seed, spec.difficulty, outcome, 9, split=SPLIT, max_steps=500,
-                memory_budget=budget, composition=composition_digest(config),
-                training=TrainingIdentity(seed, **identity) if trained else None,
-            ))  # fmt: skip
-    write_records(folder, records)
-    return folder
-
-
-def write_records(folder: Path, records: list[EpisodeRecord]) -> None:
-    (folder / "episodes.jsonl").write_text("".join(record.to_json() + "\n" for record in records))
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +33,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for row, counts in solved.items():
         for seed, won in enumerate(counts):
             write_training(root, row, seed, won)
-    write_training(root, "present_modul", 0, {"BinFill": 1}, "floor")
+    write_training(root, "present_modul", 0, {"BinFill": 1})
     write_training(root, "random", 0, 0, "floor", trained=False, parameters=None, update_s=None)
     write_training(root, "demonstrator", 0, 3, "ceiling", trained=False)
     return root
@@ -80,10 +44,14 @@ def board(rows: Path) -> Board:
     return Board(read_rows([rows]), samples=300)
 
 
+def row_of(board: Board, name: str) -> Row:
+    return next(row for row in board.rows if row.name == name)
+
+
 def test_rows_are_ranked_by_their_mean_over_trainings(board: Board) -> None:
     names = ["demonstrator", "framesamp_modul", "ttt_modul", "rmt_modul", "present_modul", "random"]
     assert [row.name for row in board.rows] == names
-    best = board.row("framesamp_modul")
+    best = row_of(board, "framesamp_modul")
     assert best.average.mean == pytest.approx(100 * 5 / 6) and best.average.std == pytest.approx(
         np.std([100, 200 / 3], ddof=1)
     )
@@ -106,11 +74,9 @@ def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> 
     assert board.noise() == pytest.approx(
         pooled([np.array([100, 200 / 3]), np.array([200 / 3, 100 / 3]), np.full(2, 100 / 3)])
     )
-    single, pair = board.row("present_modul"), board.row("rmt_modul")
+    single, pair = row_of(board, "present_modul"), row_of(board, "rmt_modul")
     draws = board.draws([single, pair], board.protocol.tasks)
-    without = Board(
-        read_rows([write_training(tmp_path, "present_modul", 0, {"BinFill": 1}, "floor").parent]), samples=300
-    )
+    without = Board(read_rows([write_training(tmp_path, "present_modul", 0, {"BinFill": 1}).parent]), samples=300)
     assert draws[0].std() > without.draws(without.rows, without.protocol.tasks)[0].std() + 5
     assert board.noise(["BinFill"]) == pytest.approx(board.noise())
 
@@ -237,10 +203,6 @@ def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
         read_rows([tmp_path])
 
 
-def records_of(folder: Path) -> list[EpisodeRecord]:
-    return [EpisodeRecord.from_json(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
-
-
 def test_an_episode_twice_is_named(tmp_path: Path) -> None:
     folder = write_training(tmp_path, "framesamp_modul", 0, 3)
     records = records_of(folder)
@@ -310,6 +272,15 @@ def test_rows_of_different_scenes_do_not_make_a_board(rows: Path, tmp_path: Path
         read_rows([rows, tmp_path])
 
 
+def test_rows_of_different_rules_do_not_make_a_board(rows: Path, tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "mine", 0, 3)
+    settings = json.loads((folder / "run.json").read_text())["settings"]
+    (folder / "run.json").unlink()
+    claim_run(folder, {**settings, "max_actions": 20, "only_possible": True})
+    with pytest.raises(UserError, match=r"mine/0 has max_choices=20, only_possible=True, but .*None.*False"):
+        read_rows([rows, tmp_path])
+
+
 def test_trainings_of_a_row_are_of_one_recipe_and_not_copies(tmp_path: Path) -> None:
     write_training(tmp_path, "a", 0, 3)
     other = write_training(tmp_path, "a", 1, 3, recipe="longer")
@@ -328,3 +299,34 @@ def test_a_folder_without_rows_is_refused(tmp_path: Path) -> None:
         read_rows([tmp_path])
     with pytest.raises(UserError, match="there is no such folder"):
         read_rows([tmp_path / "none"])
+
+
+def test_the_command_prints_the_board_and_writes_the_page(
+    rows: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_training(tmp_path, "mine", 0, 2)
+    words = ["board", f"rows={rows}", f"rows={tmp_path}", "--html", str(tmp_path / "board.html"), "--samples", "50"]
+    monkeypatch.setattr(sys, "argv", ["mme-vla nano", *words])
+    nano_command.main()
+    printed = capsys.readouterr().out
+    assert "demonstrator" in printed and "mine: place 2 of 6" in printed and "Paired comparison" in printed
+    assert "<svg" in (tmp_path / "board.html").read_text()
+
+
+def test_a_model_is_trained_before_the_board_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed: list[list[str]] = []
+
+    def train() -> None:
+        typed.append(sys.argv[1:])
+        write_training(tmp_path / SPLIT, "mine_modul", 0, 2)
+
+    monkeypatch.setattr(sys, "argv", ["mme-vla nano", "board"])
+    words = ["task=VideoUnmask", "model=mine_modul", f"split={SPLIT}", f"output={tmp_path}", "beside=[pi05]"]
+    board_command.main([*words, "--samples", "50"], train, nano_command.with_settings)
+    assert typed == [[*words, "planner=false", "floors=false", "trainings=1"]]
+    assert "mine_modul: place 1 of 1" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        board_command.main([f"split={SPLIT}"], train, nano_command.with_settings)
+    assert len(typed) == 1 and "There are no rows" in capsys.readouterr().err
