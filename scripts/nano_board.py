@@ -25,7 +25,7 @@ PAGE, EVIDENCE, FIGURE = (
 BLOCK = re.compile(r"(?<=<!-- board -->\n).*?(?=<!-- /board -->)", re.DOTALL)
 VARIANTS = [
     method.model for method in paper_methods().values()
-    if method.family in ("perceptual", "recurrent") or method.subgoal == "oracle"
+    if method.model and (method.family in ("perceptual", "recurrent") or method.subgoal == "oracle")
 ]  # fmt: skip
 EXPECTED = ["demonstrator", *VARIANTS, "pi05", MATCHED, "frequent", "random"]
 """The rows of the benchmark: ceiling, the paper's variants, floors."""

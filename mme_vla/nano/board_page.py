@@ -17,7 +17,8 @@ def ranking(board: Board, brief: bool = False) -> Table:
     suites = board.protocol.suites
     columns = ["row", "place", "trainings", "success (%)", "95 %", *suites]
     columns += [] if brief else ["parameters", "GFLOPs an update", "seconds an update", "CPU minutes of a training"]
-    rows, strong = [], set()
+    rows: list[list[str]] = []
+    strong: set[int] = set()
     for row in board.rows:
         place, at = board.places.get(row.name), ""
         if place is not None:
