@@ -19,7 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
     "exec-starts": ("exec_starts", "where the conditioning videos of a dataset end, if it has no such column"),
     "cache": ("cache", "the vision tokens of a dataset, computed once"),
-    "nano": ("nano", "from nothing to a page of results on one task, on two cores"),
+    "nano": ("nano", "small policies from nothing to results on two cores; `nano board` ranks them"),
     "vision-pretrain": ("vision_pretrain", "the vision tower of the nano backbone, from renders of the tasks"),
     "record": ("record", "demonstrate episodes of the benchmark and keep them as a dataset"),
     "gallery": ("gallery", "the tasks at a glance, one demonstrated episode each, on one page"),

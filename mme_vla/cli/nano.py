@@ -29,6 +29,10 @@ RETRIES = 20  # scenes in a row that no demonstration succeeds in
 
 def main() -> None:
     """Run the command with the task's own settings, where it has a file of them."""
+    if sys.argv[1:2] == ["board"]:  # a command of its own, which runs this one to add a row
+        from mme_vla.cli import board
+
+        return board.main(sys.argv[2:], main, with_settings)
     sys.argv[1:] = with_settings(sys.argv[1:])
     command()
 

@@ -192,10 +192,11 @@ def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
 
 
 def find_records(paths: Iterable[Path]) -> list[Path]:
-    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl` below it."""
+    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl`, or `.jsonl.xz`, below it."""
     files: list[Path] = []
     for path in paths:
-        inside = sorted(path.rglob("episodes*.jsonl")) if path.is_dir() else [path] * path.is_file()
+        below = sorted([*path.rglob("episodes*.jsonl"), *path.rglob("episodes*.jsonl.xz")])
+        inside = below if path.is_dir() else [path] * path.is_file()
         if not inside:
             what = f"holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below"
             raise UserError(f"{path} {what if path.is_dir() else 'does not exist: name files of records, or folders'}.")

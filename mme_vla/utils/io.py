@@ -5,6 +5,7 @@ Checks happen when a file is opened; what a reader returns is trusted from then 
 
 import errno
 import json
+import lzma
 import math
 import os
 import re
@@ -253,14 +254,20 @@ def read_lines[T](
     """Read a file of JSON lines, one object each: episode records, probe lines, rows, logs.
 
     A line's `crc32` (see `with_checksum`) is verified and removed. Empty lines are skipped. A half-written last line
-    without a line end is ignored with a warning: a killed process was writing it.
+    without a line end is ignored with a warning: a killed process was writing it. A file `*.xz` is decompressed.
 
     Args:
         kind: makes a value from a line's object, such as a class's `from_dict`, or `dict`.
         finite: raise an error for NaN and infinities.
     """
     # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
-    *complete, last = read_bytes(path, what, limit).split(b"\n")
+    data = read_bytes(path, what, limit)
+    if path.suffix == ".xz":
+        unpacker = lzma.LZMADecompressor()
+        with decoding(path, what, "Copy it again."):
+            data = unpacker.decompress(data, limit)
+        require(unpacker.eof, f"{path} is cut off, or has more than {limit:,} bytes of {what}. Copy it again.")
+    *complete, last = data.split(b"\n")
     values = []
     for number, line in enumerate([*complete, last], start=1):
         if not line.strip():

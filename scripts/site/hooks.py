@@ -18,6 +18,8 @@ import notebook_pages
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
+from mme_vla.utils.pages import TEMPLATES
+
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.pages import Page
@@ -42,10 +44,11 @@ def generated() -> dict[str, str]:
 
 
 def on_files(files: Files, config: "MkDocsConfig") -> Files:
-    """Add the generated pages, and a page for each linked file outside `docs/`."""
+    """Add the generated pages, a page for each linked file outside `docs/`, and the script that sorts tables."""
     pages = generated()
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
+    files.append(File.generated(config, "javascripts/sort.js", content=(TEMPLATES / "sort.js").read_text()))
     texts = {**pages, **{file.src_uri: file.content_string for file in files.documentation_pages()}}
     for target in sorted({target for path, text in texts.items() for target in outside(path, text)}):
         files.append(File.generated(config, shown_as(target), content=source_page(target)))

@@ -41,7 +41,7 @@ NOT_RUN = {
     r"torchrun|accelerate launch|--multirun": "needs several GPUs or a cluster",
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme_vla\.train ": "trains for minutes or hours",
-    r"mme_vla\.nano( |$)": "trains for minutes or hours",
+    r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/": "needs the records of an evaluation",
     r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a driver that stands in for one",

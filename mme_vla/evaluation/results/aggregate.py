@@ -79,24 +79,36 @@ def bootstrap(
 ) -> Interval:
     """Percentile interval of a mean over tasks, drawing episodes anew within each task, and trainings anew for all.
 
+    tasks: see `resampled_means`. The figure of several methods is the sum of theirs.
+    """
+    return percentiles(resampled_means(tasks, samples, seed).sum(0), confidence)
+
+
+def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
+    """The interval between two percentiles of resampled values; NaNs, which are not defined in a sample, left out."""
+    tail = (1 - confidence) / 2
+    low, high = np.nanquantile(values, [tail, 1 - tail])
+    return Interval(float(low), float(high))
+
+
+def resampled_means(tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int) -> np.ndarray:
+    """Means over tasks of each method [methods, samples], of episodes drawn within each task, and of drawn trainings.
+
     tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs of a training: an
-    episode is sampled with all of them. The figure of several methods is the sum of theirs. Of one training none is
-    drawn.
+    episode is drawn with all of them, for all methods alike. Of one training none is drawn.
     """
     rng = np.random.default_rng(seed)
     counts = [values.shape[1] for values in next(iter(tasks.values()))]
     one = rng if max(counts) == 1 else np.random.default_rng([seed, 1])
     # How often each training is drawn, as shares: [samples, trainings] a method.
     shares = [one.multinomial(n, np.full(n, 1 / n), samples) / n if n > 1 else np.ones((samples, 1)) for n in counts]
-    means = np.zeros(samples)
+    means = np.zeros((len(counts), samples))
     for of_methods in tasks.values():
         n_episodes = len(of_methods[0])
         sampled = rng.integers(0, n_episodes, (samples, n_episodes))
-        for values, share in zip(of_methods, shares, strict=True):
-            means += sum(values[:, i][sampled].mean(1) * share[:, i] for i in range(values.shape[1]))
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(means / len(tasks), [tail, 1 - tail])
-    return Interval(float(low), float(high))
+        for method, (values, share) in enumerate(zip(of_methods, shares, strict=True)):
+            means[method] += sum(values[:, i][sampled].mean(1) * share[:, i] for i in range(values.shape[1]))
+    return means / len(tasks)
 
 
 def sign_test(first: int, second: int) -> float:

@@ -36,9 +36,11 @@ class Section:
     half: bool = False
 
 
-def html_page(title: str, sections: Sequence[Section], subtitle: str = "", notes: Sequence[str] = ()) -> str:
-    """One self-contained page of these sections."""
-    return render("page.html", title=title, subtitle=subtitle, notes=notes, sections=sections)
+def html_page(
+    title: str, sections: Sequence[Section], subtitle: str = "", notes: Sequence[str] = (), sortable: bool = False
+) -> str:
+    """One self-contained page of these sections. sortable: whether a click on a heading sorts its table."""
+    return render("page.html", title=title, subtitle=subtitle, notes=notes, sections=sections, sortable=sortable)
 
 
 def html_report(results: Results, comparisons: Sequence[Comparison], title: str) -> str:

@@ -1,0 +1,74 @@
+"""`mme-vla nano board`: the ranking of nanoMME's rows, with rows of your own from folders or from a new training.
+
+Words of `mme-vla nano` train and evaluate a row first, as far as it is not there: `model=` names it.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import argument_parser
+from mme_vla.config.composition import compose
+from mme_vla.errors import printable
+
+SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
+"""The rows of the repository, a folder for each split."""
+EXAMPLES = (
+    "", "rows=outputs/nano16/reserved --html board.html",
+    "--config-dir configs model=mine_modul '+memories.mine={budget: 32, grid: 1}'",
+)  # fmt: skip
+
+
+def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable[[Sequence[str]], list[str]]) -> None:
+    """Train where a model is named, read the rows, print and write the board.
+
+    nano: `mme-vla nano`, with the words of `sys.argv`. with_settings: these words with what they imply.
+    """
+    parser = argument_parser("mme-vla nano board", __doc__, EXAMPLES)
+    parser.add_argument("words", nargs="*", metavar="KEY=VALUE",
+                        help="rows=FOLDER: rows of your own, repeatable; others: of mme-vla nano")  # fmt: skip
+    parser.add_argument("--config-dir", type=Path, help="folder of your own models, as of mme-vla nano")
+    parser.add_argument("--html", type=Path, help="write the board as one page with sortable tables and plots")
+    parser.add_argument("--samples", type=int, help="of the bootstrap")
+    with print_user_errors():
+        args = parser.parse_intermixed_args(words)
+        words = [word for word in args.words if not word.startswith("rows=")]
+        trees = [args.config_dir] if args.config_dir else []
+        config = compose("nano", with_settings(words), extra_dirs=trees)
+        trained = []
+        if any(word.startswith("model=") for word in words):
+            sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
+            nano()
+            trained.append(Path(config.output) / config.split)
+        run(args, str(config.split), trained)
+
+
+def alone(words: Sequence[str]) -> list[str]:
+    """Words for the models that they name and no other rows, with one training each if they do not say otherwise."""
+    typed = {word.partition("=")[0] for word in words}
+    others = ("beside=[]", "planner=false", "floors=false", "trainings=1")
+    return [*words, *(word for word in others if word.partition("=")[0] not in typed)]
+
+
+def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
+    """Read the rows, print the board, and write it where a file is named. trained: folders beside those of `rows=`."""
+    from mme_vla.evaluation.results.tables import comparison_table, print_table
+    from mme_vla.nano import board_page
+    from mme_vla.nano.board import SAMPLES, Board
+    from mme_vla.nano.rows import read_rows
+
+    folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
+    rows = read_rows([SHIPPED / split] if (SHIPPED / split).is_dir() else [], own=[*folders, *trained])
+    board = Board(rows, samples=args.samples or SAMPLES)
+    pairs = board.neighbours()
+    tables = [board_page.ranking(board, brief=True), board_page.targets(board)]
+    for table in [*tables, *([comparison_table(pairs)] if pairs else [])]:
+        print_table(table, 120)
+    for line in [*board_page.notes(board), *board_page.separating(board), *board_page.standing(board)]:
+        print(printable(line))
+    if args.html:
+        args.html.parent.mkdir(parents=True, exist_ok=True)
+        args.html.write_text(board_page.page(board), encoding="utf-8")
+        print(f"wrote {args.html}")

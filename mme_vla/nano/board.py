@@ -1,0 +1,323 @@
+"""The board of nanoMME: rows in the order of their success, and what the differences between them are worth.
+
+Scenes are the same for all rows. Means are over tasks. Intervals come from a bootstrap that draws scenes, and trainings
+where a row has several.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from mme_vla.errors import require
+from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, holm, percentiles, resampled_means
+from mme_vla.evaluation.results.compare import Comparison, compare, compare_all
+from mme_vla.evaluation.results.paper import PaperMethod
+from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
+from mme_vla.nano.rows import Trained, Training
+
+SAMPLES = 2000
+"""Of the bootstrap."""
+PERMUTATIONS = 9999
+MATCHED = "present_modul"
+"""The floor with as many parameters as policies with memory, and tokens of the current frame alone."""
+FLOORS = ("pi05", MATCHED)
+"""The rows without memory that are trained as policies are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A row of the board. facts: of its first training. is_own: whether it is the user's."""
+
+    name: str
+    facts: Trained
+    method: Method
+    is_own: bool = False
+
+    @property
+    def kind(self) -> str:
+        """A `policy` with memory, a `floor` or a `ceiling`."""
+        return "floor" if self.name.partition(" ")[0] in FLOORS else self.facts.kind
+
+    @property
+    def average(self) -> Figure:
+        return self.method.average
+
+    @property
+    def budget(self) -> str:
+        """The memory tokens in the row's name; empty for the default."""
+        return self.name.partition("@")[2]
+
+    @property
+    def paper(self) -> PaperMethod | None:
+        """The published method that the row is, at its default budget."""
+        known = None if self.budget else paper.paper_method(self.name, self.method.subgoal)
+        return known if known and known.name in {line["method"] for line in paper.paper_table("suites")} else None
+
+    def outcomes(self, task: str) -> np.ndarray:
+        """Success of a task [scenes, trainings], averaged over the noise seeds of a training."""
+        trainings = [[run.successes(task) for run in training] for training in self.method.trainings]
+        return np.stack([np.mean(np.array(runs, np.float64), 0) for runs in trainings], 1)
+
+    def mean(self, tasks: Sequence[str]) -> np.ndarray:
+        """Success over tasks in percent, of each training."""
+        return 100 * np.mean([self.outcomes(task).mean(0) for task in tasks], 0)
+
+
+@dataclass(frozen=True)
+class Separation:
+    """Whether memories differ on a task at a budget; success in percent.
+
+    memories: how many. lowest, mean, highest: of their success. spread: standard deviation between memories, less what
+    trainings add. noise: between trainings of one memory, None with one training each. floor, ceiling: of the best
+    floor and of the best ceiling. p: of `homogeneity`. corrected: by Holm over the tasks of the budget.
+    """
+
+    budget: str
+    task: str
+    memories: int
+    lowest: float
+    mean: float
+    highest: float
+    spread: float
+    noise: float | None
+    floor: float | None
+    ceiling: float | None
+    p: float
+    corrected: float = 1.0
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Rank correlations of so many methods with the published ranking, over the tasks of a scope."""
+
+    scope: str
+    methods: int
+    spearman: float
+    spearman_interval: Interval
+    kendall: float
+    kendall_interval: Interval
+
+
+@dataclass(frozen=True)
+class Target:
+    """A number that the benchmark aims at. reached: None where a row of it was not run."""
+
+    name: str
+    measured: str = "not run yet"
+    interval: str = ""
+    test: str = ""
+    reached: bool | None = None
+
+
+class Board:
+    """All rows, best first."""
+
+    def __init__(self, rows: Mapping[str, Sequence[Training]], samples: int = SAMPLES) -> None:
+        """Make the figures. rows: as `read_rows` gives them."""
+        require(rows, "There are no rows: train one with model=…, or name folders with rows=….")
+        scenes = next(iter(rows.values()))[0].scenes
+        tasks = sorted({key.task for key in scenes}, key=PAPER_ORDER.index)
+        counts = {sum(key.task == task for key in scenes) for task in tasks}
+        require(len(counts) == 1, f"Tasks have {sorted(counts)} scenes: a board has as many of each task.")
+        self.protocol = Protocol(tuple(tasks), counts.pop(), samples=samples)
+        self.split = next(iter(scenes.values()))[0]
+        made = [_row(name, trainings, self.protocol) for name, trainings in rows.items()]
+        self.rows = sorted(made, key=lambda row: -self.success(row))
+
+    def of_kind(self, kind: str) -> list[Row]:
+        """The rows that are a `policy`, a `floor` or a `ceiling`."""
+        return [row for row in self.rows if row.kind == kind]
+
+    @property
+    def ranked(self) -> list[Row]:
+        """The rows that have a place: all but ceilings."""
+        return [row for row in self.rows if row.kind != "ceiling"]
+
+    def success(self, row: Row, tasks: Sequence[str] = ()) -> float:
+        """A row's success over tasks, by default all, in percent."""
+        return round(float(row.mean(tasks or self.protocol.tasks).mean()), 9)  # equal counts, equal figures
+
+    def noise(self, tasks: Sequence[str] = ()) -> float | None:
+        """Standard deviation of success between trainings of one row, over all rows; None where none has two."""
+        return pooled([row.mean(tasks or self.protocol.tasks) for row in self.rows])
+
+    def draws(self, rows: Sequence[Row], tasks: Sequence[str]) -> np.ndarray:
+        """Bootstrap of the rows' success over tasks [rows, samples], in percent, on the same scenes for all.
+
+        A row of one training gets the noise that the trainings of other rows show.
+        """
+        values = {task: [row.outcomes(task) for row in rows] for task in tasks}
+        means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
+        noise, rng = self.noise(tasks), np.random.default_rng([self.protocol.seed, 2])
+        for row, sampled in zip(rows, means, strict=True):
+            if noise and row.facts.trained and len(row.method.trainings) == 1:
+                sampled += rng.normal(0, noise, len(sampled))
+        return means.round(9)
+
+    @cached_property
+    def places(self) -> dict[str, tuple[int, Interval]]:
+        """Place of each ranked row, equal rows sharing the better one, and an interval of it (`draws`)."""
+        means = np.array([self.success(row) for row in self.ranked])
+        draws = self.draws(self.ranked, self.protocol.tasks)
+        return {
+            row.name: (1 + int((means > mean).sum()), percentiles(1 + (draws > sampled).sum(0)))
+            for row, mean, sampled in zip(self.ranked, means, draws, strict=True)
+        }
+
+    def neighbours(self) -> list[Comparison]:
+        """Each row and the next; of a user's rows, with those beside them, the best and the trained floors.
+
+        P values are corrected for the number of these comparisons.
+        """
+        ranked = self.ranked
+        pairs = list(pairwise(ranked))
+        if own := [row for row in ranked if row.is_own]:
+            pairs = [pair for pair in pairs if pair[0].is_own or pair[1].is_own]
+            floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
+            pairs += [(other, row) for row in own for other in (ranked[0], *floors) if other is not row]
+        unique = {frozenset(row.name for row in pair): pair for pair in pairs}
+        return compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)
+
+    def separations(self) -> list[Separation]:
+        """Of each budget that several memories have, and each task."""
+        made = []
+        for budget in sorted({row.budget for row in self.rows}, key=lambda budget: (len(budget), budget)):
+            rows = [row for row in self.of_kind("policy") if row.budget == budget]
+            if len(rows) > 1:
+                tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
+                corrected = holm([separation.p for separation in tasks])
+                made += [replace(separation, corrected=p) for separation, p in zip(tasks, corrected, strict=True)]
+        return made
+
+    def _separation(self, budget: str, task: str, rows: Sequence[Row]) -> Separation:
+        trainings = [row.mean([task]) for row in rows]
+        means, noise = np.array([of_row.mean() for of_row in trainings]), pooled(trainings)
+        variance = means.var(ddof=1) - (noise or 0) ** 2 * np.mean([1 / len(of_row) for of_row in trainings])
+        floor, ceiling = (
+            max((self.success(row, [task]) for row in self.of_kind(kind)), default=None)
+            for kind in ("floor", "ceiling")
+        )
+        return Separation(
+            budget, task, len(rows), float(means.min()), float(means.mean()), float(means.max()),
+            float(max(0, variance)) ** 0.5, noise, floor, ceiling, homogeneity([row.outcomes(task) for row in rows]),
+        )  # fmt: skip
+
+    @property
+    def published(self) -> list[tuple[Row, PaperMethod]]:
+        """The rows that the paper reports, its best first."""
+        known = [(row, method) for row in self.rows if (method := row.paper) is not None]
+        return sorted(known, key=lambda pair: -published_success(pair[1], PAPER_ORDER))
+
+    def agreements(self) -> list[Agreement]:
+        """Rank correlations with the published success over all tasks, by suite and by task.
+
+        None below three rows, and where all are equal. Intervals are of `draws`; published figures are fixed.
+        """
+        rows, methods = [row for row, _ in self.published], [method for _, method in self.published]
+        kinds, made = ("average", "suite", "task"), []
+        for scope in sorted((s for s in scopes(self.protocol) if s.kind in kinds), key=lambda s: kinds.index(s.kind)):
+            means = np.array([self.success(row, scope.tasks) for row in rows])
+            reported = np.array([published_success(method, scope.tasks) for method in methods])
+            if len(rows) > 2 and np.ptp(means) and np.ptp(reported):
+                draws = self.draws(rows, scope.tasks).T
+                made.append(Agreement(
+                    scope.name, len(rows), float(spearman(means, reported)), percentiles(spearman(draws, reported)),
+                    float(kendall(means, reported)), percentiles(kendall(draws, reported)),
+                ))  # fmt: skip
+        return made
+
+    def targets(self) -> list[Target]:
+        """What the best policy is to reach, and its advantage over the floor of as many parameters."""
+        names = ("best memory solves at least 60 % of all episodes", f"`{MATCHED}` solves at most half of that")
+        best, matched = next(iter(self.of_kind("policy")), None), [row for row in self.rows if row.name == MATCHED]
+        if best is None:
+            return [Target(name) for name in names]
+        low, high = percentiles(self.draws([best], self.protocol.tasks)[0])
+        success = self.success(best)
+        first = Target(names[0], f"{success:.1f} % (`{best.name}`)", f"[{low:.1f}, {high:.1f}]", reached=success >= 60)
+        if not matched:
+            return [first, Target(names[1])]
+        ratios = np.divide(*self.draws([matched[0], best], self.protocol.tasks))
+        share, (low, high) = self.success(matched[0]) / success, percentiles(ratios)
+        second = Target(
+            names[1], f"{100 * share:.0f} % of it", f"[{100 * low:.0f}, {100 * high:.0f}]", reached=share <= 0.5
+        )
+        suites = [(suite, tuple(self.protocol.choose("suite", suite))) for suite in self.protocol.suites]
+        compared = [compare(best.method, matched[0].method, replace(self.protocol, tasks=tasks)) for _, tasks in suites]
+        advantages = [
+            Target(
+                f"significant advantage in {suite}", f"{c.difference:+.1f} points",
+                f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]", f"{c.wins} : {c.losses}, p = {p:.4f}",
+                reached=p < 0.05 and c.interval.low > 0,
+            )
+            for (suite, _), c, p in zip(suites, compared, holm([c.p for c in compared]), strict=True)
+        ]  # fmt: skip
+        return [first, second, *advantages]
+
+
+def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
+    methods = aggregate([record for training in trainings for record in training.records], protocol).methods
+    require(len(methods) == 1, f"The row {name} holds {len(methods)} methods: {', '.join(m.label for m in methods)}.")
+    methods[0].label = name
+    return Row(name, trainings[0].facts, methods[0], trainings[0].is_own)
+
+
+def published_success(method: PaperMethod, tasks: Sequence[str]) -> float:
+    """A method's published success over tasks, in percent."""
+    return float(np.mean([paper.per_task(method.name)[task].mean for task in tasks]))
+
+
+def pooled(groups: Sequence[np.ndarray]) -> float | None:
+    """Standard deviation within groups; None where none has two values."""
+    degrees = sum(len(group) - 1 for group in groups)
+    squares = sum(float(((group - group.mean()) ** 2).sum()) for group in groups)
+    return (squares / degrees) ** 0.5 if degrees else None
+
+
+def homogeneity(groups: Sequence[np.ndarray], permutations: int = PERMUTATIONS, seed: int = 0) -> float:
+    """P that memories which do not differ would differ as much: a permutation test of the variance between them.
+
+    groups: of each memory, outcomes [scenes, trainings]. Where a memory has several trainings, trainings change places
+    between memories: they are what another training would change. Otherwise outcomes do within each scene, which tests
+    these policies alone.
+    """
+    outcomes = np.concatenate(groups, 1)  # scenes × trainings of all memories
+    sizes = [group.shape[1] for group in groups]
+    starts = np.cumsum([0, *sizes[:-1]])
+    rng = np.random.default_rng(seed)
+
+    def variance(means: np.ndarray) -> np.ndarray:
+        """Of the memories' means, from trainings' means [..., trainings]."""
+        return (np.add.reduceat(means, starts, -1) ** 2 / sizes).sum(-1)
+
+    if max(sizes) > 1:
+        permuted = rng.permuted(np.tile(outcomes.mean(0), (permutations, 1)), axis=1)
+    else:
+        permuted = np.zeros((permutations, outcomes.shape[1]))
+        for scene in outcomes:
+            permuted += rng.permuted(np.tile(scene, (permutations, 1)), axis=1) / len(outcomes)
+    return float((1 + (variance(permuted) >= variance(outcomes.mean(0)) - 1e-12).sum()) / (1 + permutations))
+
+
+def spearman(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Spearman's rank correlation of each row of values [..., n] with reference [n]; NaN where all are equal."""
+    from scipy.stats import rankdata
+
+    first, second = (
+        ranks - ranks.mean(-1, keepdims=True) for ranks in (rankdata(values, axis=-1), rankdata(reference))
+    )
+    return _ratio((first * second).sum(-1), (first**2).sum(-1) * (second**2).sum())
+
+
+def kendall(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Kendall's tau-b of each row of values [..., n] with reference [n]; NaN where all are equal."""
+    first, second = (np.sign(x[..., :, None] - x[..., None, :]) for x in (values, reference))
+    return _ratio((first * second).sum((-1, -2)), (first**2).sum((-1, -2)) * (second**2).sum())
+
+
+def _ratio(product: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    return np.divide(product, np.sqrt(squares), out=np.full(np.shape(product), np.nan), where=squares > 0)

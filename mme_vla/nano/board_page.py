@@ -1,0 +1,219 @@
+"""The tables and figures of the board, in the terminal, in Markdown, and as one page with sortable tables."""
+
+import numpy as np
+
+from mme_vla.evaluation.results.compare import show_p
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
+from mme_vla.evaluation.results.report import Section, html_page
+from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
+from mme_vla.nano.board import Board, Row, published_success
+
+PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
+OWN = COLOURS[1]
+
+
+def ranking(board: Board, brief: bool = False) -> Table:
+    """Place, success by suite, and costs of every row; without costs where `brief`."""
+    suites = board.protocol.suites
+    columns = ["row", "place", "trainings", "success (%)", "95 %", *suites]
+    columns += [] if brief else ["parameters", "GFLOPs an update", "seconds an update", "CPU minutes of a training"]
+    rows: list[list[str]] = []
+    strong: set[int] = set()
+    for row in board.rows:
+        place, at = board.places.get(row.name), ""
+        if place is not None:
+            low, high = place[1]
+            at = f"{place[0]} [{low:.0f}, {high:.0f}]"
+        trainings = str(len(row.method.trainings)) if row.facts.trained else "–"
+        cells = [f"{board.success(row, board.protocol.choose('suite', suite)):.1f}" for suite in suites]
+        facts = row.facts
+        gflops = None if facts.update_flops is None else facts.update_flops / 1e9
+        numbers = [(facts.parameters, ",.0f"), (gflops, ".2f"), (facts.update_s, ".3f"), (facts.cpu_minutes, ".1f")]
+        costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
+        strong |= {len(rows)} if row.is_own else set()
+        rows.append([row.name, at, trainings, show(row.average), span(row.average), *cells, *costs])
+    return Table(f"Ranking, split `{board.split}`", columns, rows, strong=strong)
+
+
+def tasks(board: Board) -> Table:
+    """Success of every row on every task."""
+    names = board.protocol.tasks
+    rows = [[row.name, *(f"{board.success(row, [task]):.0f}" for task in names)] for row in board.rows]
+    return Table("Success by task (%)", ["row", *names], rows)
+
+
+def separations(board: Board) -> Table:
+    """Tasks and budgets at which memories differ, the clearest first."""
+    rows = []
+    for s in sorted(board.separations(), key=lambda s: (s.corrected, s.p, -s.spread)):
+        above, below = (None if end is None else abs(s.mean - end) for end in (s.floor, s.ceiling))
+        rows.append([
+            s.task, s.budget or "default", str(s.memories), f"{s.lowest:.0f} … {s.mean:.0f} … {s.highest:.0f}",
+            f"{s.spread:.1f}", _cell(s.noise, ".1f"), show_p(s.corrected), _cell(above, ".0f"), _cell(below, ".0f"),
+        ])  # fmt: skip
+    columns = ["task", "tokens", "memories", "lowest … mean … highest (%)", "spread", "noise", "p", "above the floor",
+               "below the ceiling"]  # fmt: skip
+    return Table("Whether memories differ", columns, rows)
+
+
+def separating(board: Board) -> list[str]:
+    """How many tasks separate memories, a sentence a budget."""
+    made = board.separations()
+    sentences = []
+    for budget in dict.fromkeys(s.budget for s in made):
+        here = [s for s in made if s.budget == budget]
+        found = [s.task for s in here if s.corrected < 0.05]
+        tokens = f"At {budget} tokens" if budget else "At the default budgets"
+        names = f": {', '.join(found)}" if found else ""
+        sentences.append(
+            f"{tokens} {len(found)} of {len(here)} tasks separate the {here[0].memories} memories (p < 0.05){names}."
+        )
+    return sentences
+
+
+def published(board: Board) -> Table:
+    """Success and place of each published method here and in the paper, over all tasks and by suite."""
+    scopes = [("all", board.protocol.tasks), *((s, board.protocol.choose("suite", s)) for s in board.protocol.suites)]
+    rows = [[row.name] for row, _ in board.published]
+    columns = ["row"]
+    for name, of_scope in scopes:
+        here = np.array([board.success(row, of_scope) for row, _ in board.published])
+        there = np.array([published_success(method, of_scope) for _, method in board.published])
+        columns += [f"{name}, here", f"{name}, paper"]
+        for cells, mine, its in zip(rows, here, there, strict=True):
+            cells += [f"{mine:.1f} ({1 + (here > mine).sum()})", f"{its:.1f} ({1 + (there > its).sum()})"]
+    return Table("Beside the published ranking: success in percent (place)", columns, rows)
+
+
+def agreements(board: Board) -> Table:
+    """Rank correlations with the published ranking."""
+    rows = [
+        [a.scope, str(a.methods), f"{a.spearman:+.2f}", "[{:+.2f}, {:+.2f}]".format(*a.spearman_interval),
+         f"{a.kendall:+.2f}", "[{:+.2f}, {:+.2f}]".format(*a.kendall_interval)]
+        for a in board.agreements()
+    ]  # fmt: skip
+    return Table(
+        "Rank correlation with the published success", ["", "methods", "Spearman", "95 %", "Kendall", "95 %"], rows
+    )
+
+
+def targets(board: Board) -> Table:
+    """The benchmark's targets, reached or not."""
+    words = {None: "", True: "yes", False: "no"}
+    rows = [[t.name, t.measured, t.interval, t.test, words[t.reached]] for t in board.targets()]
+    return Table("Targets", ["target", "measured", "95 %", "better : worse", "reached"], rows)
+
+
+def notes(board: Board) -> list[str]:
+    """What a reader of the tables has to know."""
+    noise, single = board.noise(), [row for row in board.ranked if row.facts.trained and len(row.method.trainings) == 1]
+    lines = [
+        f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split `{board.split}`, the same for "
+        "all rows."
+    ]
+    if noise is None:
+        lines.append("No row has two trainings: the noise between trainings is unknown, and intervals are too narrow.")
+    else:
+        lines.append(f"Another training of a row changes its success by {noise:.1f} points (standard deviation).")
+        if single:
+            lines.append(
+                f"Rows of one training ({len(single)}): the interval of success is over scenes alone; that of the "
+                "place has the noise of the other rows' trainings."
+            )
+    data = {row.facts.data for row in board.rows if row.facts.data}
+    if len(data) > 1:
+        lines.append(f"Rows learned from {len(data)} different sets of demonstrations.")
+    return lines
+
+
+def standing(board: Board) -> list[str]:
+    """The place of each of the user's rows, a sentence a row."""
+    lines = []
+    for row in board.ranked:
+        place, (low, high) = board.places[row.name]
+        if row.is_own:
+            lines.append(
+                f"{row.name}: place {place} of {len(board.ranked)}, between {low:.0f} and {high:.0f} with "
+                f"{100 * board.protocol.confidence:g} % confidence, with {show(row.average)} % {span(row.average)}."
+            )
+    return lines
+
+
+def success_figure(board: Board) -> str:
+    """Success of every row with its interval."""
+    rows = board.rows[::-1]
+    with figure((7.2, 0.26 * len(rows) + 1.0)) as (canvas, (axes,)):
+        for at, row in enumerate(rows):
+            low, high = row.average.interval or (0, 0)
+            mean, colour = board.success(row), OWN if row.is_own else PAINT[row.kind]
+            axes.plot([low, high], [at, at], color=colour, lw=1.6)
+            axes.plot(mean, at, "o", color=colour, ms=6)
+            axes.plot(row.mean(board.protocol.tasks), np.full(len(row.method.trainings), at), "|", color=INK, ms=7)
+        axes.set_yticks(range(len(rows)), [row.name for row in rows])
+        axes.set_xlim(0, 100)
+        axes.set_xlabel("success over all tasks (%); strokes: trainings")
+        axes.grid(True, axis="x", color="#e3e6ec")
+        return svg(canvas)
+
+
+def budget_figure(board: Board) -> str:
+    """Success over memory tokens, of the models that have rows of several budgets; empty without."""
+    models: dict[str, list[Row]] = {}
+    for row in board.of_kind("policy"):
+        if row.facts.budget is not None:
+            models.setdefault(row.name.partition("@")[0], []).append(row)
+    several = {model: rows for model, rows in models.items() if len(rows) > 1}
+    if not several:
+        return ""
+    with figure((5.6, 3.6)) as (canvas, (axes,)):
+        for number, (model, rows) in enumerate(several.items()):
+            points = sorted((row.facts.budget or 0, board.success(row), row.average.interval) for row in rows)
+            gaps = np.array([(mean - of.low, of.high - mean) for _, mean, of in points if of is not None]).T
+            axes.errorbar([b for b, *_ in points], [m for _, m, _ in points], np.maximum(gaps, 0), fmt="-o", ms=5,
+                          capsize=3, color=COLOURS[number % len(COLOURS)], label=model)  # fmt: skip
+        axes.set_xscale("log", base=2)
+        axes.set_xlabel("memory tokens")
+        axes.set_ylabel("success (%)")
+        axes.set_ylim(bottom=0)
+        legend(canvas, axes, 3)
+        return svg(canvas)
+
+
+def published_figure(board: Board) -> str:
+    """Success here over the published success, a point a method; empty without two."""
+    if len(board.published) < 2:
+        return ""
+    with figure((5.6, 3.9)) as (canvas, (axes,)):
+        for row, method in board.published:
+            x, y = published_success(method, board.protocol.tasks), board.success(row)
+            axes.plot(x, y, "o", color=PAINT[row.kind], ms=5)
+            axes.annotate(row.name, (x, y), (4, 3), textcoords="offset points", fontsize=7)
+        axes.set_xlabel("published success (%)")
+        axes.set_ylabel("success here (%)")
+        axes.grid(True, axis="both", color="#e3e6ec")
+        return svg(canvas)
+
+
+def all_tables(board: Board) -> list[Table]:
+    """Every table of the board."""
+    return [ranking(board), targets(board), comparison_table(board.neighbours()), tasks(board), separations(board),
+            published(board), agreements(board)]  # fmt: skip
+
+
+def page(board: Board) -> str:
+    """The board as one page of HTML, which loads nothing."""
+    ranks, aims, pairs, by_task, differ, beside, agree = all_tables(board)
+    sections = [
+        Section("Ranking", success_figure(board), [ranks], paragraphs=notes(board)),
+        Section("Targets", tables=[aims]),
+        Section("Neighbours", tables=[pairs], caption="P values are corrected by Holm for the number of pairs."),
+        Section("Tasks", tables=[by_task]),
+        Section("Do memories differ?", budget_figure(board), [differ], paragraphs=separating(board)),
+    ]
+    if board.published:
+        sections.append(Section("Beside the published ranking", published_figure(board), [beside, agree]))
+    return html_page("nanoMME-16", sections, f"{len(board.rows)} rows", sortable=True)
+
+
+def _cell(value: float | None, spec: str) -> str:
+    return "–" if value is None else format(value, spec)

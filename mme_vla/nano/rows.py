@@ -1,0 +1,224 @@
+"""Rows of the board of nanoMME: a folder `<row>/<training seed>` for each training, checked once when it is read.
+
+A folder holds `config.yaml`, `run.json`, `trained.json` and `episodes.jsonl` (or `episodes.jsonl.xz`). Each file names
+what it is of. Files of different trainings, scenes or settings are one error. `scenes.json` beside the rows says which
+scenes of the split can be built: a row has the first so many of these of each task, by default of all.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from mme_vla.config.sections import read_section
+from mme_vla.envs.metadata import episodes
+from mme_vla.errors import UserError, listed, require
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.store import RECORDS, RUN_FILE, find_records, read_records, read_run
+from mme_vla.policy.saving import composition_digest
+from mme_vla.policy.training_identity import TrainingIdentity
+from mme_vla.utils import read_json, read_text
+
+CONFIG, TRAINED = "config.yaml", "trained.json"
+FILES = (CONFIG, RUN_FILE, TRAINED)
+SCENES = "scenes.json"
+_SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "seed": "model_seed"}
+"""Setting of `run.json` → field of its records."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What `trained.json` holds; numbers are None where nothing was trained, as for random choices.
+
+    row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was a training. seed,
+    recipe, data, weights: its `TrainingIdentity`. budget: memory tokens. parameters: learned ones. update_s,
+    update_flops: of one update. cpu_minutes: of the training.
+    """
+
+    row: str
+    kind: Literal["policy", "floor", "ceiling"]
+    trained: bool
+    seed: int = 0
+    recipe: str | None = None
+    data: str | None = None
+    weights: str | None = None
+    budget: int | None = None
+    parameters: int | None = None
+    update_s: float | None = None
+    update_flops: float | None = None
+    cpu_minutes: float | None = None
+
+    @property
+    def identity(self) -> TrainingIdentity | None:
+        """What its records say of the training."""
+        return TrainingIdentity(self.seed, self.recipe, self.data, self.weights) if self.trained else None
+
+
+@dataclass(frozen=True)
+class Training:
+    """One training and its episodes, numbered from 0 within each task.
+
+    rules: limits of an episode. is_own: whether it is the user's.
+    """
+
+    folder: Path
+    facts: Trained
+    records: Sequence[EpisodeRecord]
+    rules: str
+    is_own: bool = False
+
+    @property
+    def scenes(self) -> dict[EpisodeKey, tuple[str, int, str, int]]:
+        """Split, seed, difficulty and step limit of each episode."""
+        return {r.key: (r.split, r.seed, r.difficulty, r.max_steps) for r in self.records}
+
+
+def read_rows(folders: Iterable[Path], own: Iterable[Path] = ()) -> dict[str, list[Training]]:
+    """The trainings of each row in or below folders, by the row's name, in the order of their seeds.
+
+    own: folders of the user, whose rows are called `<name> (yours)` where the others have the name.
+
+    Raises:
+        UserError: a folder that does not keep the schema, two trainings with the same weights or different recipes in
+            one row, or rows of different scenes.
+    """
+    trainings = [read_training(place) for place in _places(folders)]
+    names = {training.facts.row for training in trainings}
+    trainings += [replace(read_training(place), is_own=True) for place in _places(own)]
+    rows: dict[str, list[Training]] = {}
+    for training in sorted(trainings, key=lambda training: training.facts.seed):
+        name = training.facts.row
+        row = rows.setdefault(f"{name} (yours)" if training.is_own and name in names else name, [])
+        if row:
+            _check_alike(row[0], training)
+        row.append(training)
+        require(
+            training.rules == trainings[0].rules,
+            f"{training.folder} has {training.rules}, but {trainings[0].folder} {trainings[0].rules}. Rows of one "
+            "board have the same.",
+        )
+        scenes, expected = training.scenes, trainings[0].scenes
+        if scenes != expected:
+            differing = sorted({key for key in scenes | expected if scenes.get(key) != expected.get(key)})
+            raise UserError(
+                f"{training.folder} and {trainings[0].folder} have different scenes or step limits: "
+                f"{listed(f'{key.task} {key.episode}' for key in differing)}. Rows of one board have the same."
+            )
+    return rows
+
+
+def _places(folders: Iterable[Path]) -> list[Path]:
+    """The folders of trainings in or below folders."""
+    places: set[Path] = set()
+    for folder in folders:
+        require(folder.is_dir(), f"rows={folder}: there is no such folder. Name one that holds <row>/<training seed>.")
+        names = (RUN_FILE, TRAINED, "episodes*.jsonl", "episodes*.jsonl.xz")
+        below = {path.parent for name in names for path in folder.rglob(name)}
+        require(below, f"rows={folder} holds no row: no {TRAINED}, {RUN_FILE} or {RECORDS} below it.")
+        places |= below
+    return sorted(places)
+
+
+def read_training(folder: Path) -> Training:
+    """Read one folder.
+
+    Raises:
+        UserError: a file is missing or damaged, an episode is there twice, missing or of another split, or the files
+            are not of one training.
+    """
+    for name in FILES:
+        require((folder / name).is_file(), f"{folder} lacks {name}. A training's folder holds {listed(FILES)} and "
+                f"{RECORDS} or {RECORDS}.xz.")  # fmt: skip
+    facts = read_section(Trained, read_json(folder / TRAINED), f"{folder / TRAINED}", others=True)
+    run = read_run(folder)
+    try:
+        config = yaml.safe_load(read_text(folder / CONFIG, "a composed configuration"))
+    except yaml.YAMLError as error:
+        raise UserError(f"{folder / CONFIG} is not YAML: {error}.") from None
+    records = _ended([record for file in find_records([folder]) for record in read_records(file)])
+    require(records, f"{folder} lacks {RECORDS}, or it has no episode.")
+    _check_identity(folder, facts, run["settings"], config or {}, records)
+    counts = Counter(record.key for record in records)
+    twice = [f"{key.task} {key.episode}" for key, count in counts.items() if count > 1]
+    require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
+    settings = run["settings"]
+    n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
+    rules = f"max_choices={n_choices}, only_possible={possible}"
+    return Training(folder, facts, _numbered(folder, records), rules)
+
+
+def _ended(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """The records without the errors of episodes that were repeated."""
+    ended = {record.key for record in records if record.outcome != "error"}
+    return [record for record in records if record.outcome != "error" or record.key not in ended]
+
+
+def _check_identity(
+    folder: Path,
+    facts: Trained,
+    settings: Mapping[str, Any],
+    config: Mapping[str, Any],
+    records: Sequence[EpisodeRecord],
+) -> None:
+    """Make sure that the four files are of one training."""
+    fields = [(key, field) for key, field in _SETTINGS.items() if facts.trained or key in ("model", "split")]
+    expected = {"training": facts.identity, **{field: settings.get(key) for key, field in fields}}
+    if any(record.composition for record in records):
+        expected["composition"] = composition_digest(config)
+    source = {"training": TRAINED, "composition": CONFIG}
+    for record in records:
+        for field, value in expected.items():
+            require(
+                getattr(record, field) == value,
+                f"{folder}: {field} of {record.task} {record.episode} is {getattr(record, field)} in its record, but "
+                f"{value} in {source.get(field, RUN_FILE)}. These files are not of one training.",
+            )
+
+
+def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """The records with their episodes numbered from 0 within each task.
+
+    Raises:
+        UserError: they are not the first scenes of each task that can be built.
+    """
+    file, split = folder.parent.parent / SCENES, records[0].split
+    tried = read_json(file, "the scenes of a split").get("tried", {}) if file.is_file() else {}
+    n_scenes = max(Counter(record.task for record in records).values())
+    by_key = {record.key: record for record in records}
+    numbered, missing = [], []
+    for task in dict.fromkeys(record.task for record in records):
+        built = [spec for spec in episodes(task, split) if not tried.get(f"{task} {spec.episode}")]
+        for number, spec in enumerate(built[:n_scenes]):
+            record = by_key.pop(EpisodeKey(task, spec.episode), None)
+            missing += [] if record else [f"{task} {spec.episode}"]
+            if record is not None:
+                require(
+                    (record.seed, record.difficulty) == (spec.seed, spec.difficulty),
+                    f"{folder}: {task} {spec.episode} has seed {record.seed} ({record.difficulty}), but that of split "
+                    f"{split!r} has {spec.seed} ({spec.difficulty}).",
+                )
+                numbered.append(replace(record, episode=number))
+    require(
+        not missing and not by_key,
+        f"{folder} does not have the first {n_scenes} scenes of each task in split {split!r}: it lacks "
+        f"{listed(missing) or 'none'}, and has {listed(f'{task} {n}' for task, n in by_key) or 'none'} beside them.",
+    )
+    return numbered
+
+
+def _check_alike(first: Training, other: Training) -> None:
+    """Make sure that two trainings of a row are of one recipe, and not the same one."""
+    for name in ("kind", "recipe", "data", "budget"):
+        values = [getattr(training.facts, name) for training in (first, other)]
+        require(
+            values[0] == values[1],
+            f"{first.folder} and {other.folder} are trainings of the row {first.facts.row}, but {name} is {values[0]} "
+            f"and {values[1]}. Give them different names of rows.",
+        )
+    require(
+        first.facts.seed != other.facts.seed and first.facts.weights != other.facts.weights,
+        f"{first.folder} and {other.folder} have the same seed or weights: they are one training.",
+    )

@@ -1,0 +1,116 @@
+"""Write the table, the figure and the evidence page of nanoMME from the rows in benchmarks/nano16.
+
+python scripts/nano_board.py                                # pages, from the rows that are committed
+python scripts/nano_board.py --add outputs/nano16/reserved  # copy the rows of a run first, records compressed
+"""
+
+import argparse
+import lzma
+import re
+import shutil
+from pathlib import Path
+
+from mme_vla.evaluation.results.paper import paper_methods
+from mme_vla.evaluation.results.tables import Table, to_markdown
+from mme_vla.evaluation.store import RECORDS
+from mme_vla.nano import board_page
+from mme_vla.nano.board import MATCHED, Board
+from mme_vla.nano.rows import FILES, SCENES, read_rows, read_training
+
+ROOT = Path(__file__).resolve().parents[1]
+ROWS = ROOT / "benchmarks" / "nano16"
+PAGE, EVIDENCE, FIGURE = (
+    ROOT / "docs" / name for name in ("train/nano.md", "evidence/nano-board.md", "images/nano16.svg")
+)
+BLOCK = re.compile(r"(?<=<!-- board -->\n).*?(?=<!-- /board -->)", re.DOTALL)
+VARIANTS = [
+    method.model for method in paper_methods().values()
+    if method.model and (method.family in ("perceptual", "recurrent") or method.subgoal == "oracle")
+]  # fmt: skip
+EXPECTED = ["demonstrator", *VARIANTS, "pi05", MATCHED, "frequent", "random"]
+"""The rows of the benchmark: ceiling, the paper's variants, floors."""
+
+
+def add(folder: Path) -> None:
+    """Copy the rows of a run's split into the repository, checked, with compressed records."""
+    split = None
+    for place in sorted(path.parent for path in folder.rglob("trained.json")):
+        training = read_training(place)
+        split = ROWS / training.records[0].split
+        target = split / training.facts.row / str(training.facts.seed)
+        target.mkdir(parents=True, exist_ok=True)
+        for name in FILES:
+            shutil.copyfile(place / name, target / name)
+        lines = b"".join(path.read_bytes() for path in sorted(place.glob("episodes*.jsonl")))
+        (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
+        print(f"added {target.relative_to(ROOT)}")
+    if split and (folder / SCENES).is_file():
+        shutil.copyfile(folder / SCENES, split / SCENES)
+
+
+def boards() -> list[Board]:
+    """A board for each split that has rows, the one with the most rows first."""
+    splits = sorted({path.parents[2] for path in ROWS.rglob("trained.json")})
+    return sorted((Board(read_rows([split])) for split in splits), key=lambda board: -len(board.rows))
+
+
+def block(board: Board | None) -> str:
+    """The part of the user's page that comes from the rows."""
+    if board is None:
+        return f"Not run yet: {_names(EXPECTED)}.\n"
+    missing = [name for name in EXPECTED if name not in {row.name for row in board.rows}]
+    lines = [
+        *board_page.notes(board),
+        *board_page.separating(board),
+        *([f"Not run yet: {_names(missing)}."] if missing else []),
+    ]
+    table = untitled(board_page.ranking(board, brief=True))
+    figure = f"![Success of every row with its interval](../images/{FIGURE.name})"
+    return "\n".join([table, figure, "", *(f"- {line}" for line in lines), ""])
+
+
+def evidence(made: list[Board]) -> str:
+    """The page with every table."""
+    head = (
+        "# nanoMME-16: the board\n\nEvery table of the [board](../train/nano.md), "
+        "from the rows in `benchmarks/nano16`, written by `python scripts/nano_board.py`.\n"
+    )
+    parts = [head] + ([] if made else ["Not run yet.\n"])
+    for board in made:
+        listed = [*board_page.notes(board), *board_page.separating(board)]
+        parts.append("\n".join([f"## Split `{board.split}`", "", *(f"- {line}" for line in listed), ""]))
+        parts += [to_markdown(table) for table in board_page.all_tables(board) if table.rows]
+    return "\n".join(parts)
+
+
+def untitled(table: Table) -> str:
+    """A table in Markdown without its title."""
+    return to_markdown(table).partition("\n\n")[2]
+
+
+def pages(made: list[Board]) -> dict[Path, str]:
+    """The text of each page."""
+    text = block(made[0] if made else None)
+    return {PAGE: BLOCK.sub(lambda _: text, PAGE.read_text()), EVIDENCE: evidence(made)}
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--add", type=Path, help="folder <output>/<split> of a run whose rows are copied first")
+    args = parser.parse_args()
+    if args.add:
+        add(args.add)
+    made = boards()
+    for path, text in pages(made).items():
+        path.write_text(text)
+    if made:
+        svg = board_page.success_figure(made[0])
+        FIGURE.write_text(svg.replace("<svg ", '<svg style="background: white" ', 1))
+
+
+if __name__ == "__main__":
+    main()

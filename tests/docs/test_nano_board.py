@@ -1,0 +1,38 @@
+"""The pages of nanoMME's board hold what its committed rows say."""
+
+from pathlib import Path
+
+import nano_board
+import pytest
+
+from helpers.nano_rows import TASKS, write_training
+
+
+def test_the_pages_are_those_of_the_committed_rows() -> None:
+    made = nano_board.boards()
+    for path, text in nano_board.pages(made).items():
+        assert path.read_text() == text, f"run `python scripts/nano_board.py`: {path.name} differs from the rows"
+    assert not made or nano_board.FIGURE.is_file()
+
+
+def test_committed_rows_are_compressed_and_small() -> None:
+    files = [path for path in nano_board.ROWS.rglob("*") if path.is_file()]
+    assert not any(path.suffix == ".jsonl" for path in files)
+    assert sum(path.stat().st_size for path in files) <= 5e6
+
+
+def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows that are not there yet are named, and no number is written for them."""
+    assert nano_board.block(None).startswith("Not run yet: `demonstrator`, ") and "|" not in nano_board.block(None)
+    assert len(nano_board.VARIANTS) == 14
+    monkeypatch.setattr(nano_board, "ROOT", tmp_path)
+    monkeypatch.setattr(nano_board, "ROWS", tmp_path / "rows")
+    for seed, won in enumerate((3, 2)):
+        write_training(tmp_path / "run", "framesamp_modul", seed, won)
+    write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
+    nano_board.add(tmp_path / "run")
+    (board,) = nano_board.boards()
+    text = nano_board.block(board)
+    assert "| framesamp_modul | 1 [1, 1] | 2 | 83.33 ± 23.57 |" in text and "Not run yet: `demonstrator`" in text
+    assert "`framesamp_modul`" not in text.partition("Not run yet")[2]
+    assert "### Success by task (%)" in nano_board.evidence([board])

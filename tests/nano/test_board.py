@@ -1,0 +1,332 @@
+"""Rows of the board: what a folder must hold, and the ranking, tests, targets and pages that are made of them."""
+
+import json
+import lzma
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import kendalltau, spearmanr
+
+from helpers.nano_rows import SCENES, SPLIT, TASKS, records_of, write_records, write_training
+from mme_vla import UserError
+from mme_vla.cli import board as board_command
+from mme_vla.cli import nano as nano_command
+from mme_vla.envs.metadata import episodes
+from mme_vla.evaluation.store import claim_run, read_folders
+from mme_vla.nano import board_page
+from mme_vla.nano.board import Board, Row, homogeneity, kendall, pooled, spearman
+from mme_vla.nano.rows import read_rows, read_training
+from mme_vla.policy.training_identity import TrainingIdentity
+from mme_vla.utils import write_json
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three memories of two trainings, a floor of as many parameters, one of random choices, and the demonstrator."""
+    root = tmp_path_factory.mktemp("rows")
+    solved = {"framesamp_modul": (3, 2), "ttt_modul": (2, 1), "rmt_modul": (1, 1)}
+    for row, counts in solved.items():
+        for seed, won in enumerate(counts):
+            write_training(root, row, seed, won)
+    write_training(root, "present_modul", 0, {"BinFill": 1})
+    write_training(root, "random", 0, 0, "floor", trained=False, parameters=None, update_s=None)
+    write_training(root, "demonstrator", 0, 3, "ceiling", trained=False)
+    return root
+
+
+@pytest.fixture(scope="module")
+def board(rows: Path) -> Board:
+    return Board(read_rows([rows]), samples=300)
+
+
+def row_of(board: Board, name: str) -> Row:
+    return next(row for row in board.rows if row.name == name)
+
+
+def test_rows_are_ranked_by_their_mean_over_trainings(board: Board) -> None:
+    names = ["demonstrator", "framesamp_modul", "ttt_modul", "rmt_modul", "present_modul", "random"]
+    assert [row.name for row in board.rows] == names
+    best = row_of(board, "framesamp_modul")
+    assert best.average.mean == pytest.approx(100 * 5 / 6) and best.average.std == pytest.approx(
+        np.std([100, 200 / 3], ddof=1)
+    )
+    assert {row.name: board.places[row.name][0] for row in board.ranked} == dict(
+        zip(names[1:], range(1, 6), strict=True)
+    )
+    low, high = board.places["ttt_modul"][1]
+    assert 1 <= low <= 2 <= high <= 4
+
+
+def test_equal_rows_share_a_place(rows: Path, tmp_path: Path) -> None:
+    for row, won in {"a": 2, "b": 2, "c": 1}.items():
+        write_training(tmp_path, row, 0, won)
+    places = Board(read_rows([tmp_path]), samples=50).places
+    assert [places[name][0] for name in "abc"] == [1, 1, 3]
+
+
+def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> None:
+    """The noise between trainings is pooled over rows, and widens the place of a row that has one training."""
+    assert board.noise() == pytest.approx(
+        pooled([np.array([100, 200 / 3]), np.array([200 / 3, 100 / 3]), np.full(2, 100 / 3)])
+    )
+    single, pair = row_of(board, "present_modul"), row_of(board, "rmt_modul")
+    draws = board.draws([single, pair], board.protocol.tasks)
+    without = Board(read_rows([write_training(tmp_path, "present_modul", 0, {"BinFill": 1}).parent]), samples=300)
+    assert draws[0].std() > without.draws(without.rows, without.protocol.tasks)[0].std() + 5
+    assert board.noise(["BinFill"]) == pytest.approx(board.noise())
+
+
+def test_users_rows_are_compared_with_the_rows_beside_the_best_and_the_floors(rows: Path, tmp_path: Path) -> None:
+    write_training(tmp_path, "mine", 0, {"BinFill": 3, "VideoUnmask": 2})
+    board = Board(read_rows([rows], own=[tmp_path]), samples=50)
+    pairs = [(c.first, c.second) for c in board.neighbours()]
+    assert pairs == [
+        ("ttt_modul", "mine"),
+        ("mine", "rmt_modul"),
+        ("framesamp_modul", "mine"),
+        ("present_modul", "mine"),
+    ]
+    assert board.places["mine"][0] == 3 and board_page.standing(board)[0].startswith("mine: place 3 of 6, between ")
+    assert board_page.ranking(board).strong == {[row.name for row in board.rows].index("mine")}
+
+
+def test_a_users_row_of_a_known_name_stands_beside_it(rows: Path, tmp_path: Path) -> None:
+    write_training(tmp_path, "ttt_modul", 0, 3)
+    read = read_rows([rows], own=[tmp_path])
+    assert len(read["ttt_modul"]) == 2 and [t.is_own for t in read["ttt_modul (yours)"]] == [True]
+
+
+def test_targets_have_intervals_and_are_not_reached_by_weak_evidence(board: Board, tmp_path: Path) -> None:
+    first, second, *suites = board.targets()
+    assert first.measured == "83.3 % (`framesamp_modul`)" and first.reached
+    assert second.measured == "10 % of it" and second.reached
+    assert [t.name.rpartition(" ")[2] for t in suites] == list(board.protocol.suites)
+    assert [t.test for t in suites] == [f"{n} : 0, p = 1.0000" for n in (2, 3, 3, 3)]
+    assert not any(t.reached for t in suites)
+    alone = Board(read_rows([write_training(tmp_path, "a", 0, 1).parent]), samples=50)
+    assert [t.measured for t in alone.targets()] == ["33.3 % (`a`)", "not run yet"]
+
+
+def test_tasks_that_separate_memories_stand_out() -> None:
+    rng = np.random.default_rng(0)
+    apart = [np.tile((np.arange(20) < n)[:, None], (1, 3)).astype(float) for n in (2, 6, 10, 14, 18)]
+    assert homogeneity(apart, 999) == pytest.approx(0.001)
+    alike = [rng.random((20, 3)) < 0.5 for _ in range(5)]
+    assert homogeneity(alike, 999) > 0.05
+    assert homogeneity([group[:, :1] for group in apart], 999) == pytest.approx(0.001)
+
+
+def test_no_false_alarm_where_trainings_differ_as_much_as_memories() -> None:
+    rng = np.random.default_rng(1)
+    trainings = [np.tile((np.arange(20) < n)[:, None], 1).astype(float) for n in rng.permutation(np.arange(1, 19))]
+    groups = [np.concatenate(trainings[i : i + 3], 1) for i in range(0, 18, 3)]
+    assert homogeneity(groups, 999) > 0.05
+
+
+def test_the_homogeneity_test_keeps_its_level() -> None:
+    rng = np.random.default_rng(2)
+    p_values = [homogeneity([rng.random((6, 2)) < 0.5 for _ in range(4)], 99, seed) for seed in range(200)]
+    assert 0.01 < np.mean(np.array(p_values) <= 0.05) < 0.1
+
+
+def test_separations_state_spread_noise_floor_and_ceiling(board: Board) -> None:
+    made = board.separations()
+    assert [s.task for s in made] == list(board.protocol.tasks) and all(s.memories == 3 for s in made)
+    first = made[0]
+    assert (first.lowest, first.highest, first.ceiling) == pytest.approx((100 / 3, 500 / 6, 100))
+    assert first.floor == pytest.approx(100 / 3) and made[1].floor == 0
+    assert first.noise == pytest.approx(board.noise()) and first.corrected >= first.p
+    assert board_page.separating(board)[0].startswith("At the default budgets 0 of 4 tasks separate the 3 memories")
+
+
+def test_budgets_are_tables_of_their_own(rows: Path, tmp_path: Path) -> None:
+    for row in ("framesamp_modul@4", "ttt_modul@4", "framesamp_modul@16"):
+        write_training(tmp_path, row, 0, 1, budget=int(row.partition("@")[2]))
+    board = Board(read_rows([rows, tmp_path]), samples=50)
+    assert [(s.budget, s.memories) for s in board.separations()] == [("", 3)] * 4 + [("4", 2)] * 4
+    assert "framesamp_modul" in board_page.budget_figure(board) and all(not row.budget for row, _ in board.published)
+
+
+def test_rank_correlations_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(0)
+    values, reference = rng.integers(0, 6, (5, 14)).astype(float), rng.integers(0, 20, 14).astype(float)
+    for row, rho, tau in zip(values, spearman(values, reference), kendall(values, reference), strict=True):
+        assert rho == pytest.approx(spearmanr(row, reference)[0]) and tau == pytest.approx(
+            kendalltau(row, reference)[0]
+        )
+    assert np.isnan(spearman(np.ones(3), np.arange(3.0))) and kendall(np.arange(3.0), np.arange(3.0)) == 1
+
+
+def test_the_published_ranking_stands_beside(board: Board) -> None:
+    assert [row.name for row, _ in board.published] == ["framesamp_modul", "ttt_modul", "rmt_modul"]
+    agreements = {a.scope: a for a in board.agreements()}
+    assert list(agreements) == ["average", *board.protocol.suites, *board.protocol.tasks]
+    assert agreements["average"].spearman == 1 and agreements["average"].methods == 3
+    assert agreements["average"].spearman_interval.low < 1
+    cells = board_page.published(board).rows[0]
+    assert cells[1] == "83.3 (1)" and cells[2].endswith("(1)")
+
+
+def test_the_page_holds_the_numbers(board: Board) -> None:
+    html = board_page.page(board)
+    for text in ("framesamp_modul", "83.33 ± 23.57", "1,419,194", "12.00", "0.130", "Targets"):
+        assert text in html
+    assert f"{board.noise():.1f} points (standard deviation)" in html
+    assert "<svg" in html and "addEventListener" in html
+    assert not re.search(r"(src|href)=.?http|@import|fetch\(", html)
+
+
+def test_compressed_records_are_the_same(tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "framesamp_modul", 0, 3)
+    plain = folder / "episodes.jsonl"
+    packed = folder / "episodes.jsonl.xz"
+    records = read_training(folder).records
+    packed.write_bytes(lzma.compress(plain.read_bytes()))
+    plain.unlink()
+    assert read_training(folder).records == records
+    assert len(read_folders([packed])) == SCENES * len(TASKS)
+    packed.write_bytes(packed.read_bytes()[:-40])
+    with pytest.raises(UserError, match="cut off"):
+        read_training(folder)
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "run.json", "trained.json", "episodes.jsonl"])
+def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+    folder = write_training(tmp_path, "framesamp_modul", 0, 3)
+    (folder / name).unlink()
+    with pytest.raises(UserError, match=f"framesamp_modul/0.* {name}"):
+        read_rows([tmp_path])
+
+
+def test_an_episode_twice_is_named(tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "framesamp_modul", 0, 3)
+    records = records_of(folder)
+    write_records(folder, [replace(records[4], outcome="error", error="no"), *records])
+    read_training(folder)  # an error that was repeated is no second result
+    write_records(folder, [*records, replace(records[4], outcome="fail")])
+    with pytest.raises(UserError, match=r"framesamp_modul/0 has episodes twice: VideoUnmask 1"):
+        read_training(folder)
+
+
+def test_a_split_that_is_not_whole_is_named(tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "framesamp_modul", 0, 3)
+    write_records(folder, records_of(folder)[:-2])
+    with pytest.raises(UserError, match=r"first 3 scenes .* it lacks MoveCube 1, MoveCube 2, and has none"):
+        read_training(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"split": "val"}, "split of BinFill 0 is val in its record, but further in run.json"),
+        ({"seed": 1}, "BinFill 0 has seed 1 .*but that of split 'further' has"),
+        ({"episode": 77}, "lacks BinFill 0, and has BinFill 77 beside"),
+        ({"training": TrainingIdentity(0, "r", "d", "other")}, "training of BinFill 0 is .*other.*trained.json"),
+        ({"training": TrainingIdentity(0, "r", "x", "framesamp_modul0")}, "training of BinFill 0"),
+        ({"composition": "0123"}, "composition of BinFill 0 is 0123 .*config.yaml"),
+        ({"checkpoint": 7}, "checkpoint of BinFill 0 is 7 .*run.json"),
+    ],
+)
+def test_records_of_something_else_are_named(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    folder = write_training(tmp_path, "framesamp_modul", 0, 3)
+    first, *others = records_of(folder)
+    write_records(folder, [replace(first, **change), *others])
+    with pytest.raises(UserError, match=words) as error:
+        read_rows([tmp_path])
+    assert str(folder) in str(error.value)
+
+
+def test_changed_settings_and_facts_are_named(tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "framesamp_modul", 0, 3)
+    path, text = folder / "trained.json", (folder / "trained.json").read_text()
+    path.write_text(json.dumps({**json.loads(text), "kind": "ladder"}))
+    with pytest.raises(UserError, match=r"trained\.json.*kind.*'policy'|kind=.ladder"):
+        read_training(folder)
+    path.write_text(text)
+    run = folder / "run.json"
+    run.write_text(run.read_text().replace('"max_steps": 500', '"max_steps": 600'))
+    with pytest.raises(UserError, match=r"run\.json is damaged"):
+        read_training(folder)
+
+
+def test_scenes_that_cannot_be_built_are_replaced_by_later_ones(tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "a", 0, 2)
+    write_json(tmp_path / "scenes.json", {"split": SPLIT, "tried": {"BinFill 1": "no place", "BinFill 0": ""}})
+    with pytest.raises(UserError, match="lacks BinFill 3, and has BinFill 1 beside them"):
+        read_training(folder)
+    spec, records = episodes("BinFill", SPLIT)[3], records_of(folder)
+    records[1] = replace(records[1], episode=3, seed=spec.seed, difficulty=spec.difficulty)
+    write_records(folder, records)
+    assert [r.episode for r in read_training(folder).records if r.task == "BinFill"] == [0, 1, 2]
+
+
+def test_rows_of_different_scenes_do_not_make_a_board(rows: Path, tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "mine", 0, 3)
+    write_records(folder, [record for record in records_of(folder) if record.episode < 2])
+    with pytest.raises(UserError, match=r"mine/0 and .* have different scenes or step limits: BinFill 2"):
+        read_rows([rows, tmp_path])
+
+
+def test_rows_of_different_rules_do_not_make_a_board(rows: Path, tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "mine", 0, 3)
+    settings = json.loads((folder / "run.json").read_text())["settings"]
+    (folder / "run.json").unlink()
+    claim_run(folder, {**settings, "max_actions": 20, "only_possible": True})
+    with pytest.raises(UserError, match=r"mine/0 has max_choices=20, only_possible=True, but .*None.*False"):
+        read_rows([rows, tmp_path])
+
+
+def test_trainings_of_a_row_are_of_one_recipe_and_not_copies(tmp_path: Path) -> None:
+    write_training(tmp_path, "a", 0, 3)
+    other = write_training(tmp_path, "a", 1, 3, recipe="longer")
+    write_records(other, [replace(r, training=TrainingIdentity(1, "longer", "d", "a1")) for r in records_of(other)])
+    with pytest.raises(UserError, match="recipe is r and longer"):
+        read_rows([tmp_path])
+    copy = write_training(tmp_path, "b", 1, 3, weights="b0")
+    write_records(copy, [replace(r, training=TrainingIdentity(1, "r", "d", "b0")) for r in records_of(copy)])
+    write_training(tmp_path, "b", 0, 3)
+    with pytest.raises(UserError, match="they are one training"):
+        read_rows([tmp_path / "b"])
+
+
+def test_a_folder_without_rows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no row"):
+        read_rows([tmp_path])
+    with pytest.raises(UserError, match="there is no such folder"):
+        read_rows([tmp_path / "none"])
+
+
+def test_the_command_prints_the_board_and_writes_the_page(
+    rows: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_training(tmp_path, "mine", 0, 2)
+    words = ["board", f"rows={rows}", f"rows={tmp_path}", "--html", str(tmp_path / "board.html"), "--samples", "50"]
+    monkeypatch.setattr(sys, "argv", ["mme-vla nano", *words])
+    nano_command.main()
+    printed = capsys.readouterr().out
+    assert "demonstrator" in printed and "mine: place 2 of 6" in printed and "Paired comparison" in printed
+    assert "<svg" in (tmp_path / "board.html").read_text()
+
+
+def test_a_model_is_trained_before_the_board_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed: list[list[str]] = []
+
+    def train() -> None:
+        typed.append(sys.argv[1:])
+        write_training(tmp_path / SPLIT, "mine_modul", 0, 2)
+
+    monkeypatch.setattr(sys, "argv", ["mme-vla nano", "board"])
+    words = ["task=VideoUnmask", "model=mine_modul", f"split={SPLIT}", f"output={tmp_path}", "beside=[pi05]"]
+    board_command.main([*words, "--samples", "50"], train, nano_command.with_settings)
+    assert typed == [[*words, "planner=false", "floors=false", "trainings=1"]]
+    assert "mine_modul: place 1 of 1" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        board_command.main([f"split={SPLIT}"], train, nano_command.with_settings)
+    assert len(typed) == 1 and "There are no rows" in capsys.readouterr().err
