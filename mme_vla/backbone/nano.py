@@ -16,35 +16,13 @@ from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hoo
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
-from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
+from mme_vla.backbone.nano_vision import CLASSES, ConvTower
 from mme_vla.backbone.pi05 import initialise
+from mme_vla.backbone.tower import PlaceTower, TowerConfig, load_shipped
 from mme_vla.errors import check_choice, check_multiple
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch, Noise, map_noise
-
-
-@dataclass(frozen=True)
-class TowerConfig:
-    """The convolutional vision tower: channels of its stages over 32×32, 16×16 and 8×8 places of a 128-pixel image.
-
-    `blocks_…` are residual blocks. `pretrained` takes the weights that ship with the library.
-    """
-
-    image_size: int = 128
-    width_32: int = 48
-    width_16: int = 96
-    width_8: int = 160
-    blocks_32: int = 1
-    blocks_16: int = 1
-    blocks_8: int = 2
-    pretrained: bool = True
-
-    def __post_init__(self) -> None:
-        check_positive(self, "vision.")
-        check_multiple("vision.", "image_size", self.image_size, "stride", 16)
-        for name in ("width_32", "width_16", "width_8"):
-            check_multiple("vision.", name, getattr(self, name), "groups", 8)
 
 
 @dataclass(frozen=True)
@@ -162,7 +140,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     each sample, which share the context.
     """
 
-    vision: ConvTower
+    vision: ConvTower | PlaceTower
     Config = NanoConfig
     supports = frozenset({"blocks", "expert", "hook"})
     lora_targets = ("qkv", "read_q", "out", "read_out", "up", "down")
@@ -182,13 +160,12 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         self.image_size, self.grid = tower.image_size, tower.image_size // 16
         self.horizon, self.action_dim = config.horizon, config.action_dim
         # The tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
-        self.vision = ConvTower(
-            (tower.width_32, tower.width_16, tower.width_8), (tower.blocks_32, tower.blocks_16, tower.blocks_8), width
-        )
+        sizes = tower.widths, tower.blocks
+        self.vision = PlaceTower(*sizes) if tower.layout == "places" else ConvTower(*sizes, width)
         self.vision_width = self.vision.token_width
         initialise(self.vision)
         if tower.pretrained and self.vision.out.weight.device.type != "meta":
-            load_shipped(self.vision)
+            load_shipped(self.vision, tower.layout)
         self.places = nn.Embedding(self.grid**2, width)
         self.views = nn.Embedding(MAX_VIEWS, width)
         self.see_in = nn.Linear(self.vision_width, width)

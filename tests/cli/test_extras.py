@@ -79,8 +79,8 @@ SUFFICE = [
     Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
     Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
-    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
-                   "output=tower", "nano_vision.safetensors", draws=True),
+    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 held_out=1 arrangements=1 steps=1 "
+                   "batch_size=1 output=tower", "nano_tower.safetensors", draws=True),
     Case(("sim",), "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
          "recorded: 1 episodes", draws=True),
     Case(("sim",), "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),

@@ -1,7 +1,6 @@
 """The nano backbone, its tower and its tokens; and what stands between demonstrations and training."""
 
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +8,7 @@ import pytest
 import torch
 
 from helpers.nano_policies import demonstration, nano
-from mme_vla import UserError, build_policy
-from mme_vla.backbone.nano_vision import CLASSES, WEIGHTS
+from mme_vla import UserError
 from mme_vla.cli import nano as nano_command
 from mme_vla.cli.nano import check_counts, with_settings
 from mme_vla.nano.demonstrations import Demonstration
@@ -27,24 +25,6 @@ SMALL = {
 
 def test_it_keeps_a_backbones_contract() -> None:
     check_backbone("nano", **SMALL)
-
-
-def test_the_shipped_tower_weighs_under_six_megabytes_and_other_sizes_are_refused() -> None:
-    assert len(files("mme_vla").joinpath(WEIGHTS).read_bytes()) < 6e6
-    with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
-        build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})
-
-
-def test_the_shipped_tower_names_what_is_where() -> None:
-    """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far from it."""
-    tower = nano("pi05").backbone.vision
-    image = torch.full((1, 3, 128, 128), 0.3)
-    image[0, :, 52:60, 66:74] = torch.tensor([0.7, -0.9, -0.9])[:, None, None]
-    with torch.no_grad():
-        shares = tower.answers(image)[0].softmax(2)[0]  # token, class, place
-    red = shares[:, CLASSES.index("red cube")].amax(-1).view(8, 8)
-    assert red.argmax() == 3 * 8 + 4 and red[3, 4] > 0.5
-    assert shares[:, CLASSES.index("green cube")].max() < 0.5
 
 
 def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
