@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.backbone.tower import CLASSES, PlaceTower, TowerConfig
+from mme_vla.backbone.tower import CLASSES, FLOOR, PlaceTower, TowerConfig
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.grounding import project
 from mme_vla.envs.observations import INTRINSIC, front_extrinsic
@@ -27,11 +27,11 @@ from mme_vla.weights.torch_files import load_torch_file
 
 logger = logging.getLogger(__name__)
 EMPTY = -5.0  # logit of presence in a fresh tower
-SHIFT = 6  # pixels that an image is moved by at most
 POSITIVE = 2.0  # weight of a cell that shows an object, before those of classes
+SHIFT = 6  # pixels that an image is moved by at most
 PLACE_WEIGHT = 2.0  # of the error of places, in cells, beside that of presences
 BATCH = 64  # images that are evaluated together
-THRESHOLD = 0.5  # presence of a cell from which on an object is reported
+VOTES = 1.5  # presences that make an object, which has four cells
 APART = 0.75  # cells: nearer reports of a class are one
 FOUND = 3.0  # centimetres between an object and its report at most
 
@@ -43,7 +43,7 @@ class PretrainSettings:
     save_every: updates between two drafts. seed: of everything random.
     """
 
-    steps: int = 400
+    steps: int = 450
     batch_size: int = 32
     lr: float = 2e-3
     save_every: int = 100
@@ -153,8 +153,9 @@ def tower_loss(logits: Tensor, offsets: Tensor, presence: Tensor, places: Tensor
     """
     each = weights[:, None, None] * (1 + (POSITIVE - 1) * presence)
     cross_entropy = functional.binary_cross_entropy_with_logits(logits, presence, each, reduction="sum")
-    error = (weights[:, None, None] * presence)[:, :, None] * (offsets - places).abs()
-    count = (weights[:, None, None] * presence).sum().clamp(min=1)
+    labelled = weights[:, None, None] * presence
+    error = labelled[:, :, None] * (offsets - places).abs()
+    count = labelled.sum().clamp(min=1)
     return (cross_entropy + PLACE_WEIGHT * error.sum()) / count
 
 
@@ -175,7 +176,7 @@ def pretrain(
     if weights_file.is_file():
         return weights_file
     folder.mkdir(parents=True, exist_ok=True)
-    scenes = Scenes.load(files)
+    scenes = Scenes.load(sorted(files))
     weights, frequencies = scenes.weights()
     tower.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in the stubs
     optimizer = torch.optim.AdamW(tower.parameters(), lr=settings.lr, weight_decay=0.01)
@@ -241,20 +242,26 @@ class ClassResult:
 def find_objects(presence: Tensor, offsets: Tensor) -> list[tuple[float, float]]:
     """Column and row, 0 … 1, of the objects that a tower reports of one class in one image.
 
-    Cells above `THRESHOLD` report the surest first; those that report nearly the same place as a surer one do not
-    count.
+    Cells vote for the places that they report, the surest first. Votes for nearly the same place are one object, at
+    their mean, if they come to `VOTES`.
 
     Args:
         presence: [g, g]. offsets: [2, g, g].
     """
-    rows, columns = (presence > THRESHOLD).nonzero().unbind(1)
-    order = presence[rows, columns].argsort(descending=True)
-    where = torch.stack([columns, rows], 1)[order] + 0.5 + offsets[:, rows, columns].T[order]
-    objects: list[Tensor] = []
-    for place in where:
-        if all((place - other).norm() > APART for other in objects):
-            objects.append(place)
-    return [(float(column), float(row)) for column, row in (place / len(presence) for place in objects)]
+    rows, columns = (presence > FLOOR).nonzero().unbind(1)
+    votes, order = presence[rows, columns].sort(descending=True)
+    places = (torch.stack([columns, rows], 1) + 0.5 + offsets[:, rows, columns].T)[order]
+    objects: list[tuple[Tensor, Tensor]] = []  # sum of places and of votes
+    for place, vote in zip(places, votes, strict=True):
+        distances = [float((total / count - place).norm()) for total, count in objects]
+        if distances and min(distances) < APART:
+            nearest = distances.index(min(distances))
+            total, count = objects[nearest]
+            objects[nearest] = total + vote * place, count + vote
+        else:
+            objects.append((vote * place, vote))
+    means = [total / count / len(presence) for total, count in objects if count >= VOTES]
+    return [(float(column), float(row)) for column, row in means]
 
 
 def on_plane(place: tuple[float, float], height: float) -> np.ndarray:

@@ -82,7 +82,7 @@ def test_labels_move_with_their_image() -> None:
 def test_what_is_hidden_or_outside_the_image_has_no_place() -> None:
     segmentation = np.zeros((256, 256), np.int32)
     segmentation[100:110, 100:110], segmentation[200, 200:205] = 3, 4
-    away = np.array([10.0, 10.0, 10.0])
+    away = np.array([0.2, 3.0, 0.02])
     places = [Place(RED, CENTRES[0], [3]), Place(BUTTON, CENTRES[1], [4]), Place(RED, away, [3])]
     visible = visible_places(places, segmentation)
     assert visible.shape == (1, 4) and np.allclose(visible[0], [RED, *CENTRES[0]])
