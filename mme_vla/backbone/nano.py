@@ -19,7 +19,7 @@ from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, a
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower
 from mme_vla.backbone.pi05 import initialise
 from mme_vla.backbone.tower import PlaceTower, TowerConfig, load_shipped
-from mme_vla.errors import check_choice, check_multiple
+from mme_vla.errors import check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch, Noise, map_noise
@@ -48,6 +48,10 @@ class NanoConfig:
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
         check_choice("backbone.goal", self.goal, ("text", "swap"))
+        require(
+            self.goal == "text" or self.vision.layout == "segments",
+            f"backbone.vision.layout={self.vision.layout}: backbone.goal=swap needs segments; use backbone.goal=text.",
+        )
         check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)
         check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))

@@ -31,7 +31,7 @@ POSITIVE = 2.0  # weight of a cell that shows an object, before those of classes
 SHIFT = 6  # pixels that an image is moved by at most
 PLACE_WEIGHT = 2.0  # of the error of places, in cells, beside that of presences
 BATCH = 64  # images that are evaluated together
-VOTES = 1.5  # presences that make an object, which has four cells
+VOTES = 1.0  # presences that make an object, which has four cells
 APART = 0.75  # cells: nearer reports of a class are one
 FOUND = 3.0  # centimetres between an object and its report at most
 

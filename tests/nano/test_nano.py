@@ -93,8 +93,8 @@ def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
 
 
 def test_policies_of_earlier_versions_highlight_what_the_goal_names_first_in_images_and_memory() -> None:
-    assert MMEPolicy.from_pretrained("nano").backbone.config.goal == "swap"
-    policy = nano(**{"backbone.goal": "swap"})
+    policy = MMEPolicy.from_pretrained("nano")
+    assert policy.backbone.config.goal == "swap"
     backbone, processor = policy.backbone, policy.require_processor()
     ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
     unmarked, unmarked_mask = processor.prompt("press the button")
@@ -109,7 +109,7 @@ def test_the_goal_weighs_what_is_seen_by_its_words_and_not_by_what_is_behind_the
     backbone, processor = policy.backbone, policy.require_processor()
     goals = ["pick up the red cube", "pick up the green cube"]
     ids, masks = (torch.stack(part) for part in zip(*map(processor.prompt, goals), strict=True))
-    tokens = torch.ones(2, 3, 96)
+    tokens = torch.ones(2, 3, backbone.vision_width)
     with torch.no_grad():
         read = backbone.condition_on_prompt(tokens, ids, masks)
         padded = backbone.condition_on_prompt(tokens, torch.where(masks, ids, 7), masks)
