@@ -244,6 +244,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         if self.goal_reader is not None:
             weights = self.goal_reader.weigh(self.goal_reader(self._words(prompt), prompt_mask)).to(tokens.dtype)
             return tokens * (1 + weights.view(len(prompt), *[1] * (tokens.ndim - 2), -1))
+        assert isinstance(self.vision, ConvTower)  # as `NanoConfig` says
         named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
         places = torch.where(named.any(1), named.int().argmax(1), prompt.shape[1])
         first = torch.where(named.any(2).any(1), places.argmin(1), FIRST)  # b

@@ -193,18 +193,18 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
     _light(env, rng)
     near = [thing for thing in env.things if np.abs(thing.position).max() < 0.5]
     place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), rng.uniform(0.03, 0.35)])
-    thing = near[rng.integers(len(near))] if near and rng.random() < 0.6 else None
-    if thing is not None:
-        place = thing.position + np.array([0, 0, rng.uniform(0.01, 0.2)])
+    over = near[rng.integers(len(near))] if near and rng.random() < 0.6 else None
+    if over is not None:
+        place = over.position + np.array([0, 0, rng.uniform(0.01, 0.2)])
     joints = arm.ik(_pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * _pose(q=(0, 1, 0, 0)), env.qpos)
     if joints is None:
         return
-    grasped = not env.stick and thing is not None and rng.random() < 0.5
-    grasped = grasped and _class_of(thing).endswith(("cube", "container"))
+    grasped = not env.stick and over is not None and rng.random() < 0.5
+    grasped = grasped and _class_of(over).endswith(("cube", "container"))
     fingers = [] if env.stick else [rng.uniform(0.014, 0.021) if grasped else rng.uniform(0.03, 0.04)] * 2
     env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
-    if grasped and thing is not None:
-        thing.move_to(_pose(env.tcp_pose.p, thing.pose.q))
+    if grasped and over is not None:
+        over.move_to(_pose(env.tcp_pose.p, over.pose.q))
 
 
 def _put_elsewhere(thing: Any, rng: np.random.Generator) -> None:

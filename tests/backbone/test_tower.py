@@ -71,9 +71,9 @@ def test_a_fresh_tower_reports_nothing_and_its_seed_makes_it() -> None:
 def test_the_shipped_weights_are_small_and_other_sizes_are_refused() -> None:
     assert len(files("mme_vla").joinpath(WEIGHTS).read_bytes()) < 10e6
     with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
-        build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})
+        build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})  # type: ignore[arg-type]
     with pytest.raises(UserError, match="layout=segments is of checkpoints"):
-        build_policy("pi05", backbone="nano", **{"backbone.vision.layout": "segments"})
+        build_policy("pi05", backbone="nano", **{"backbone.vision.layout": "segments"})  # type: ignore[arg-type]
 
 
 def test_the_checkpoint_of_before_keeps_its_tower() -> None:
