@@ -104,6 +104,7 @@ MEMORIES: Registry[Any] = Registry(
                 "keyframes",
                 "learned_topk",
                 "moment",
+                "present",
                 "pyramid",
                 "retrieval",
                 "spacetime",

@@ -16,35 +16,13 @@ from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hoo
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
-from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
+from mme_vla.backbone.nano_vision import CLASSES, ConvTower
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.errors import check_choice, check_multiple
+from mme_vla.backbone.tower import PlaceTower, TowerConfig, load_shipped
+from mme_vla.errors import check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
 from mme_vla.types import Batch, Noise, map_noise
-
-
-@dataclass(frozen=True)
-class TowerConfig:
-    """The convolutional vision tower: channels of its stages over 32×32, 16×16 and 8×8 places of a 128-pixel image.
-
-    `blocks_…` are residual blocks. `pretrained` takes the weights that ship with the library.
-    """
-
-    image_size: int = 128
-    width_32: int = 48
-    width_16: int = 96
-    width_8: int = 160
-    blocks_32: int = 1
-    blocks_16: int = 1
-    blocks_8: int = 2
-    pretrained: bool = True
-
-    def __post_init__(self) -> None:
-        check_positive(self, "vision.")
-        check_multiple("vision.", "image_size", self.image_size, "stride", 16)
-        for name in ("width_32", "width_16", "width_8"):
-            check_multiple("vision.", name, getattr(self, name), "groups", 8)
 
 
 @dataclass(frozen=True)
@@ -64,15 +42,23 @@ class NanoConfig:
     draws: int = 4
     time_distribution: str = "beta"
     head: Mapping[str, Any] = field(default_factory=lambda: {"name": "clean_flow"}, hash=False)
+    goal: str = "swap"
+    """How vision tokens are read with the goal: see `NanoBackbone.condition_on_prompt`. Checkpoints without it swap."""
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
+        check_choice("backbone.goal", self.goal, ("text", "swap"))
+        require(
+            self.goal == "text" or self.vision.layout == "segments",
+            f"backbone.vision.layout={self.vision.layout}: backbone.goal=swap needs segments; use backbone.goal=text.",
+        )
         check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)
         check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))
 
 
 MAX_VIEWS, MAX_WORDS = 4, 256
+GOAL_QUERIES = 4
 FIRST = CLASSES.index("red cube") - 1
 """Index, among the classes of a token, of the class that the goal names."""
 STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
@@ -131,6 +117,25 @@ class Reader(nn.Module):
         return x + (1 + gate) * self.down(nn.functional.gelu(inner) * opening)
 
 
+class GoalReader(nn.Module):
+    """Reads the goal as text: learned queries attend to its words, and what they read weighs vision tokens.
+
+    A product of goal and token is what it takes to find the object that a goal names among all that a token shows.
+    """
+
+    def __init__(self, config: NanoConfig, token_width: int) -> None:
+        super().__init__()
+        width = config.vlm.width
+        self.queries = nn.Linear(width, GOAL_QUERIES, bias=False)
+        self.weigh = nn.Linear(GOAL_QUERIES * width, token_width)
+        self.condition = nn.Linear(GOAL_QUERIES * width, config.action.width)
+
+    def forward(self, words: Tensor, mask: Tensor) -> Tensor:
+        """What the queries read [b, q·d] of words [b, l, d]."""
+        scores = self.queries(words).masked_fill(~mask[..., None], torch.finfo(words.dtype).min)
+        return torch.einsum("blq,bld->bqd", scores.softmax(1), words).flatten(1)
+
+
 class Column(nn.Module):
     """What a block of context becomes for the action column: keys and values of every layer, in one product."""
 
@@ -162,7 +167,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     each sample, which share the context.
     """
 
-    vision: ConvTower
+    vision: ConvTower | PlaceTower
     Config = NanoConfig
     supports = frozenset({"blocks", "expert", "hook"})
     lora_targets = ("qkv", "read_q", "out", "read_out", "up", "down")
@@ -170,7 +175,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     lora_exclude = r"\.\w*norm\.dense$"
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vision\.",
-        "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\.",
+        "vlm": r"embedding\.|goal_reader\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\.",
         "memory": r"columns\.",
         "action": "",
     }
@@ -182,13 +187,12 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         self.image_size, self.grid = tower.image_size, tower.image_size // 16
         self.horizon, self.action_dim = config.horizon, config.action_dim
         # The tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
-        self.vision = ConvTower(
-            (tower.width_32, tower.width_16, tower.width_8), (tower.blocks_32, tower.blocks_16, tower.blocks_8), width
-        )
+        sizes = tower.widths, tower.blocks
+        self.vision = PlaceTower(*sizes) if tower.layout == "places" else ConvTower(*sizes, width)
         self.vision_width = self.vision.token_width
         initialise(self.vision)
         if tower.pretrained and self.vision.out.weight.device.type != "meta":
-            load_shipped(self.vision)
+            load_shipped(self.vision, tower.layout)
         self.places = nn.Embedding(self.grid**2, width)
         self.views = nn.Embedding(MAX_VIEWS, width)
         self.see_in = nn.Linear(self.vision_width, width)
@@ -196,6 +200,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         self.embedding = nn.Embedding(config.vocab_size, width)
         self.positions = nn.Embedding(MAX_WORDS, width)
         self.prompt_in = nn.Sequential(nn.Linear(width, action_width), nn.GELU(), nn.Linear(action_width, action_width))
+        self.goal_reader = GoalReader(config, self.vision_width) if config.goal == "text" else None
         self.state_in = nn.Linear(2 * len(STATE_FREQUENCIES) * config.state_dim, action_width)
         self.time_in = nn.Sequential(
             nn.Linear(action_width, action_width), nn.SiLU(), nn.Linear(action_width, action_width)
@@ -230,10 +235,16 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             return tokens
 
     def condition_on_prompt(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
-        """Swap the class that the prompt names first with the first cube, so that one index holds the requested class.
+        """Vision tokens [b, …, d] as they are read with a prompt.
 
-        `ConvTower.words`, part of the tower's weights, says which word names which class.
+        With `goal=text` each of their numbers is weighed by what `GoalReader` reads. `goal=swap` is of policies of
+        earlier versions: the class of cubes that the prompt names first and the first class are exchanged, so that one
+        index holds the requested one; `ConvTower.words`, part of the tower's weights, says which word names which.
         """
+        if self.goal_reader is not None:
+            weights = self.goal_reader.weigh(self.goal_reader(self._words(prompt), prompt_mask)).to(tokens.dtype)
+            return tokens * (1 + weights.view(len(prompt), *[1] * (tokens.ndim - 2), -1))
+        assert isinstance(self.vision, ConvTower)  # as `NanoConfig` says
         named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
         places = torch.where(named.any(1), named.int().argmax(1), prompt.shape[1])
         first = torch.where(named.any(2).any(1), places.argmin(1), FIRST)  # b
@@ -256,11 +267,14 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
         encoded = located + self.see(located)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
-        words = self.embedding(batch.prompt) + self.positions.weight[: batch.prompt.shape[1]]
         return [
             Block("images", encoded.flatten(1, 2), image_mask, "vlm"),
-            Block("prompt", words, batch.prompt_mask, "vlm"),
+            Block("prompt", self._words(batch.prompt), batch.prompt_mask, "vlm"),
         ]
+
+    def _words(self, prompt: Tensor) -> Tensor:
+        words: Tensor = self.embedding(prompt) + self.positions.weight[: prompt.shape[1]]
+        return words
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, r, h, a] and flow times `time` [n, r], for r noisy versions a sample."""
@@ -308,6 +322,8 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         (prompt,) = (block for block in injection.blocks if block.name == "prompt")
         words = self.prompt_in(prompt.tokens) * batch.prompt_mask[..., None]
         condition = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
+        if self.goal_reader is not None:
+            condition = condition + self.goal_reader.condition(self.goal_reader(prompt.tokens, prompt.mask))
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
         return Context(keys_values, mask, condition, injection.hook)

@@ -1,31 +1,12 @@
-"""The nano backbone's vision tower: a small convolutional network, pretrained on renders of the sixteen tasks."""
+"""The vision tower of nano checkpoints from before `tower.PlaceTower`: which of twelve classes each place shows."""
 
 import math
 from collections.abc import Sequence
-from importlib.resources import files
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import require
-
-WEIGHTS = "assets/nano_vision.safetensors"
-STRIDES = (4, 2, 2)
-"""Of the three stages: a 128-pixel image becomes 32×32, 16×16 and 8×8 places."""
-
-
-class Residual(nn.Module):
-    """x + two 3×3 convolutions of its normalised self."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.norm = nn.GroupNorm(8, width)
-        self.first = nn.Conv2d(width, width, 3, padding=1)
-        self.second = nn.Conv2d(width, width, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(nn.functional.gelu(self.first(self.norm(x))))
-
+from mme_vla.backbone.tower import build_stages
 
 CLASSES = (
     "nothing", "robot", "red cube", "green cube", "blue cube", "other cube", "container", "button", "target", "disc",
@@ -36,8 +17,6 @@ FINE, COARSE = 8, 4
 """A token means 8×8 places that show a class each, and for 4×4 places that have a colour each."""
 LOUDNESS = (1.0, 32.0, 320.0, 320.0, 0.1)
 """Factors of presence, share, column, row and colours, which bring them to one size."""
-
-
 WORDS = 2048
 """Entries of the shipped tokenizer."""
 FAINT = 0.02
@@ -57,28 +36,17 @@ class ConvTower(nn.Module):
     """
 
     words: Tensor
-    columns: Tensor
-    rows: Tensor
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int], out: int) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        before = 3
-        for width, count, stride in zip(widths, blocks, STRIDES, strict=True):
-            kernel = stride + 2 * (stride // 2)  # windows overlap: places know what is at their borders
-            layers.append(nn.Conv2d(before, width, kernel, stride, padding=(kernel - stride) // 2))
-            layers += [Residual(width) for _ in range(count)]
-            before = width
-        self.stages = nn.Sequential(*layers)
+        self.stages = nn.Sequential(*(layer for stage in build_stages(widths, blocks) for layer in stage))
+        before = widths[-1]
         self.norm = nn.GroupNorm(8, before)
         self.out = nn.Conv2d(before, out, 1)
         self.classes = nn.Linear(out, FINE**2 * len(CLASSES))
         self.colours = nn.Linear(out, COARSE**2 * 3)
         # word of the shipped tokenizer × class but the first: 1 where the word names the class
         self.register_buffer("words", torch.zeros(WORDS, len(CLASSES) - 1))
-        line = (torch.arange(FINE) + 0.5) / FINE * 2 - 1
-        self.register_buffer("columns", line.repeat(FINE), persistent=False)
-        self.register_buffer("rows", line.repeat_interleave(FINE), persistent=False)
 
     @property
     def token_width(self) -> int:
@@ -97,23 +65,10 @@ class ConvTower(nn.Module):
         share = mass / (mass.sum(1, keepdim=True) + FAINT)
         grid = math.isqrt(shares.shape[1])
         middles = (torch.arange(grid, device=shares.device) + 0.5) / grid * 2 - 1
-        column, row = ((shares * line).mean(-1) / mass / grid for line in (self.columns, self.rows))
+        line = (torch.arange(FINE, device=shares.device) + 0.5) / FINE * 2 - 1
+        lines = line.repeat(FINE), line.repeat_interleave(FINE)
+        column, row = ((shares * line).mean(-1) / mass / grid for line in lines)
         column = share * (column + middles.repeat(grid)[:, None])
         row = share * (row + middles.repeat_interleave(grid)[:, None])
         parts = (presence, share, column, row, colours)
         return torch.cat([part * factor for part, factor in zip(parts, LOUDNESS, strict=True)], -1)
-
-
-def load_shipped(tower: ConvTower) -> None:
-    """Give a tower the weights that ship with the library."""
-    from safetensors.torch import load
-
-    state = {name: value.float() for name, value in load(files("mme_vla").joinpath(WEIGHTS).read_bytes()).items()}
-    expected = tower.state_dict()
-    require(
-        {name: value.shape for name, value in state.items()} == {name: value.shape for name, value in expected.items()},
-        "The vision weights that ship with the library are for the sizes in configs/backbone/nano.yaml. With "
-        "others set backbone.vision.pretrained=false, or train a tower of that size: python -m "
-        "mme_vla.nano.vision_pretrain.",
-    )
-    tower.load_state_dict(state)

@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.config.composition import compose, resolved
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 logger = logging.getLogger("mme_vla.nano")
 LEVELS = ("easy", "medium", "hard")
@@ -27,32 +27,42 @@ def main(cfg: DictConfig) -> None:
 
 def run(config: Mapping[str, Any]) -> Path:
     """Both stages; the path of the weights."""
-    import torch
+    from mme_vla.backbone.tower import TowerConfig
+    from mme_vla.config.sections import read_section
+    from mme_vla.nano.pretraining import PretrainSettings, fresh_tower, pretrain
 
+    require(
+        0 <= config["held_out"] < config["scenes"],
+        f"held_out={config['held_out']}: must be less than scenes={config['scenes']}, which it is a part of.",
+    )
+    sizes = read_section(TowerConfig, resolved(compose("policy", ["backbone=nano"]).backbone.vision), "backbone.vision")
+    files, held_out = _record(config, sizes.image_size)
+    names = ("steps", "batch_size", "lr", "save_every", "seed")
+    settings = PretrainSettings(**{name: config[name] for name in names})
+    return pretrain(fresh_tower(sizes, settings.seed), files, held_out, Path(config["output"]), settings)
+
+
+def _record(config: Mapping[str, Any], size: int) -> tuple[list[Path], list[Path]]:
+    """Render what is missing; the files of the scenes to learn from, and of those held out: the last of each task."""
     from mme_vla.data.console import progress
     from mme_vla.envs.episodes import choose_tasks
     from mme_vla.envs.scene.placement import SceneError
-    from mme_vla.nano.pretraining import PretrainSettings, fresh_tower, pretrain
-    from mme_vla.nano.scenes import record_scenes
+    from mme_vla.nano.scenes import record_scene
 
-    sizes = compose("policy", ["backbone=nano"]).backbone.vision
-    width = compose("policy", ["backbone=nano"]).backbone.vlm.width
-    folder, tasks = Path(config["output"]), choose_tasks(config["tasks"])
+    folder, first, tasks = Path(config["output"]) / "scenes", config["first_seed"], choose_tasks(config["tasks"])
     scenes = [(task, number) for number in range(config["scenes"]) for task in tasks]
-    files = []
+    learned: list[Path] = []
+    held_out: list[Path] = []
     with progress("scenes", len(scenes)) as advance:
         for task, number in scenes:
-            scene = task, config["first_seed"] + number, LEVELS[number % len(LEVELS)]
+            scene = task, first + number, LEVELS[number % len(LEVELS)]
+            measures = number >= config["scenes"] - config["held_out"]
             try:
-                files.append(record_scenes(folder / "scenes", *scene, config["arrangements"], sizes.image_size))
+                file = record_scene(folder, *scene, 0 if measures else config["arrangements"], size)
+                (held_out if measures else learned).append(file)
             except SceneError as error:  # of the benchmark's own rule, which tries so many times
                 logger.info("left out: %s", error)
             advance(1)
-    if not files:
-        raise UserError(f"None of the {len(scenes)} scenes can be built: change first_seed={config['first_seed']}.")
-    settings = PretrainSettings(
-        **{key: config[key] for key in ("steps", "batch_size", "lr", "held_out", "save_every", "seed")}
-    )
-    torch.manual_seed(settings.seed)
-    tower, grid = fresh_tower({str(key): value for key, value in sizes.items()}, width)
-    return pretrain(tower, grid, files, folder, settings)
+    if not learned:
+        raise UserError(f"None of the {len(scenes)} scenes can be built: change first_seed={first}.")
+    return learned, held_out

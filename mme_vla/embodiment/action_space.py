@@ -67,11 +67,15 @@ MIDDLE: Place = (0.5, 0.5)
 
 @dataclass(frozen=True)
 class Option:
-    """What can be chosen: its letter (`a`, `b`, …), what it does in words, and whether it needs a point."""
+    """What can be chosen: its letter (`a`, `b`, …), what it does in words, and whether it needs a point.
+
+    possible: whether the environment offers it now; it is listed in any case.
+    """
 
     label: str
     action: str
     needs_point: bool = False
+    possible: bool = True
 
     @property
     def number(self) -> int:
@@ -103,7 +107,7 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
         wordy = right and len(option["action"]) > MOST_WORDS
         if not (len(label) == 1 and label in known and not wordy and isinstance(needs, bool)):
             raise UserError(f"The option {brief(option)} cannot be chosen; expected {expected}.")
-        options.append(Option(label, " ".join(option["action"].split()), needs))
+        options.append(Option(label, " ".join(option["action"].split()), needs, option.get("possible", True) is True))
     require(
         len({option.label for option in options}) >= len(options), f"The options {brief(value)} have a letter twice."
     )
@@ -288,7 +292,7 @@ class ActionSpace:
             return actions
         _require(options)
         out = actions.clone()
-        offered = [self.choice[option.number] for option in options]
+        offered = [self.choice[option.number] for option in options if option.possible]
         best = actions[..., offered].argmax(-1, keepdim=True)
         out[..., list(self.choice)] = 0
         out[..., offered] = out[..., offered].scatter(-1, best, 1)

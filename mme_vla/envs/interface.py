@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 FrameHook = Callable[[dict[str, Any], dict[str, Any], bool], None]
 """Called with each returned frame, its info, and whether it belongs to the conditioning video."""
 _CLOSED = "The environment is closed; make a new one."
+_REACH = 1.2  # metres from the arm's base; what was moved away lies ten metres off
 _MARGIN = 2  # The benchmark counts two steps more than its limit.
 
 
@@ -119,6 +120,8 @@ class RoboMMEEnv(gymnasium.Env):
         max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
+        only_possible: mark options whose every object is out of the arm's reach as not possible. The benchmark offers
+            them, and choosing one ends the episode.
         reward: `none`, as in the benchmark, `sparse`, `subtask` (`mme_vla.envs.subtasks`), or your own in `REWARDS`.
 
     Attributes:
@@ -136,13 +139,14 @@ class RoboMMEEnv(gymnasium.Env):
         include: Include | None = None,
         render: bool = True,
         reward: str = "none",
+        only_possible: bool = False,
     ) -> None:
         is_count = type(max_steps) is int and max_steps >= 1
         require(is_count, f"max_steps is {max_steps!r}; expected a positive integer.")
         check_known("reward", reward, REWARDS)
         self._space, self._total_reward = action_space(action), REWARDS[reward]
         self.include = include or Include()
-        self.max_steps = max_steps
+        self.max_steps, self._only_possible = max_steps, only_possible
         self.on_frame: FrameHook | None = None
         self.render_request: RenderRequest | None = None
         self.render_mode = "rgb_array" if render else None
@@ -380,14 +384,28 @@ class RoboMMEEnv(gymnasium.Env):
             segmentation = self._observer.segmentation if self._render else None
             info["grounded_subgoal_online"] = self._grounding.update(subtask, segmentation)
         if self.include.available_multi_choices or self._space.name == "multi_choice":
-            info["available_multi_choices"] = [
-                {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}
-                for choice in task.choices()
-            ]
+            info["available_multi_choices"] = self._options()
         for name in CAMERAS:
             if getattr(self.include, f"{name}_camera_intrinsic"):
                 info[f"{name}_camera_intrinsic"] = INTRINSIC.copy()
         return info
+
+    def _options(self) -> list[dict[str, Any]]:
+        """What the task offers to choose from."""
+        choices = self.task.choices()
+        options: list[dict[str, Any]] = [
+            {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point} for choice in choices
+        ]
+        if self._only_possible:
+            base = self.task.agent.robot.pose.sp.p
+            possible = [
+                choice.candidates is None
+                or any(np.linalg.norm(thing.position - base) < _REACH for thing in choice.candidates())
+                for choice in choices
+            ]
+            for option, here in zip(options, possible, strict=True):
+                option["possible"] = here or not any(possible)
+        return options
 
     def _timed_out(self, run: _Run) -> bool:
         return run.count >= self.max_steps + run.held + _MARGIN

@@ -38,6 +38,7 @@ def make_env(
     reward: str = "none",
     env: str = "mme_vla",
     sessions: int = 0,
+    only_possible: bool = False,
     **include: bool,
 ) -> "RoboMMEEnv | OfficialEnv":
     """Make the environment of one episode.
@@ -61,6 +62,7 @@ def make_env(
         env: `mme_vla`, `official` for the installed package `robomme`, or an environment of the user's own. Of the
             options the latter reads `max_steps`, `render` and the action space `multi_choice`.
         sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
+        only_possible: by choices, mark options that no object within reach fits (`RoboMMEEnv`).
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
             `include_available_multi_choices`, `include_maniskill_obs`.
@@ -79,9 +81,9 @@ def make_env(
     max_steps = metadata.step_limit(split) if max_steps is None else max_steps
     if env == "official":
         require(
-            seed is None and row is None and recovery is None and render and reward == "none",
+            seed is None and row is None and recovery is None and render and reward == "none" and not only_possible,
             'env="official" takes episodes of a split, renders and gives no reward: leave out seed, row, '
-            "recovery, render, reward.",
+            "recovery, render, reward, only_possible.",
         )
         return make_official_env(task, split, episode, action_space, max_steps, include)
     scene: dict[str, Any] = {"seed": seed, "difficulty": difficulty}
@@ -102,7 +104,7 @@ def make_env(
 
     scene |= {} if recovery is None else {"recovery": recovery}
     return RoboMMEEnv(make_task(task, render=render, obs_mode=obs_mode, **scene), action_space, max_steps, included,
-                      render, reward)  # fmt: skip
+                      render, reward, only_possible)  # fmt: skip
 
 
 def check_sessions(split: str, sessions: int) -> None:

@@ -126,13 +126,15 @@ FURTHER, FURTHER_EPISODES = "further", 100
 _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
 """Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
-_COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS}
+RESERVED = "reserved"
+"""Episodes for one final test of what was chosen on others; no split of the benchmark."""
+_COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS, RESERVED: 100}
 KNOWN = (*_COUNTS, HARD, CHALLENGE, OOD)
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _TEST_SEED = (500_000, 10_000)
 _FIRST_SEED = {
     "train": (0, 1000), "val": (1_000_000, 10_000), "test": _TEST_SEED, MORE: (2_000_000, 100_000),
-    **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
+    RESERVED: (5_000_000, 10_000), **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
 }  # fmt: skip
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 
@@ -196,7 +198,8 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
             path of a JSONL file of scenes (`rows`); a variant (`Variant`), whose seeds are the same; or `more`,
             900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
             gives after its own 50 (number 0 is what number 50 would be; no seed was raised), or `further_easy`,
-            `further_medium`, `further_hard`, 400 of one difficulty by the same rule.
+            `further_medium`, `further_hard`, 400 of one difficulty by the same rule, or `reserved`, 100 with seeds of
+            their own from 5,010,000 on.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
     """
@@ -239,7 +242,7 @@ def is_other(split: str) -> bool:
     """Whether a split has other episodes than those that the paper's figures are about."""
     variant = read_variant(split)
     base = split if variant is None else variant.base
-    return base in FURTHER_SPLITS or base in (HARD, CHALLENGE) or is_row_split(base)
+    return base in FURTHER_SPLITS or base in (HARD, CHALLENGE, RESERVED) or is_row_split(base)
 
 
 def all_tasks() -> tuple[str, ...]:

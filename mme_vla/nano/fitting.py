@@ -2,28 +2,30 @@
 
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from omegaconf import OmegaConf
+from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose, import_plugins, resolved
 from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.nano.demonstrations import Demonstration
-from mme_vla.nano.learning import Decisions, position_error, statistics
+from mme_vla.nano.learning import Decisions, choice_errors, position_error, statistics
+from mme_vla.nano.tokens import FrameTokens, TokenStore
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning, copy_tower
 from mme_vla.policy.mme import MMEPolicy, mme_of
-from mme_vla.policy.run_folders import training_name
 from mme_vla.policy.training_identity import KEY as TRAINING
-from mme_vla.policy.training_identity import identify
-from mme_vla.processing.normalise import NormStats
-from mme_vla.processing.processor import STATS_FILE
+from mme_vla.policy.training_identity import identify, identity_of
 from mme_vla.training.checkpoint import checkpoints_in
 from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
@@ -32,7 +34,7 @@ from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.utils import read_lines, write_json
 
-DONE = "trained.json"
+DONE, ROW_CONFIG = "trained.json", "config.yaml"
 HELD_OUT = 10  # One demonstration in so many only measures the loss
 
 
@@ -70,74 +72,72 @@ def build(config: Mapping[str, Any]) -> MMEPolicy:
     return policy
 
 
-def train_all(
-    config: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    folder: Path,
-    files: Sequence[Path],
-    learning: Mapping[str, Any],
-    trainings: int = 1,
-) -> list[Path]:
-    """Train policies with consecutive seeds, or continue with them; the last checkpoints.
+@dataclass(frozen=True)
+class Training:
+    """One training of a row.
 
-    One is trained in `folder`, several in numbered folders of it. They share the tokens. The others: see `train`.
+    row: what the page calls it. config: as `compose_policy` gives it, with the training's own seed. settings, learning:
+    the sections `train` and `learning`. folder: of the run. files: demonstrations; one in `HELD_OUT` only measures.
+    store: their tokens. tower_seed: of the tower's weights where they are fresh.
     """
-    if trainings == 1:
-        return [train(config, settings, folder, files, learning)]
-    seed = int(config["seed"])
-    return [
-        train({**config, "seed": seed + i}, settings, run, files, learning, tokens=folder, tower_seed=seed)
-        for i, run in enumerate(training_folders(folder, trainings))
-    ]
+
+    row: str
+    config: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    learning: Mapping[str, Any]
+    folder: Path
+    files: Sequence[Path]
+    store: TokenStore
+    tower_seed: int = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing left to do."""
+        return (self.folder / DONE).is_file()
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last checkpoint of a training that is done."""
+        return checkpoints_in(self.folder / "checkpoints")[-1]
 
 
-def training_folders(folder: Path, trainings: int) -> list[Path]:
-    """The run folders of a row of the page."""
-    return [folder] if trainings == 1 else [folder / training_name(number) for number in range(trainings)]
+def train_in_process(job: Training) -> Path:
+    """`train` with one thread, for several processes side by side."""
+    torch.set_num_threads(1)
+    return train(job)
 
 
-def train(
-    config: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    folder: Path,
-    files: Sequence[Path],
-    learning: Mapping[str, Any],
-    *,
-    tokens: Path | None = None,
-    tower_seed: int | None = None,
-) -> Path:
-    """Train a policy in `folder`, or continue with it; the last checkpoint.
-
-    config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`. files:
-    demonstrations; one in `HELD_OUT` only measures the loss. tokens: folder of the decisions' tokens, by default
-    `folder`. tower_seed: of the tower's weights where they are fresh, by default the training's.
-    """
+def train(job: Training) -> Path:
+    """Train a policy, or continue with it; the last checkpoint."""
     from accelerate import Accelerator
 
-    if (folder / DONE).is_file():
-        return checkpoints_in(folder / "checkpoints")[-1]
+    if job.done:
+        return job.checkpoint
     begun, cpu = time.perf_counter(), time.process_time()
-    train_settings = TrainSettings.from_dict(settings, int(config["seed"]))
-    full_config = {**config, "train": dict(settings), "learning": dict(learning)}
+    folder, settings = job.folder, job.settings
+    train_settings = TrainSettings.from_dict(settings, int(job.config["seed"]))
+    full_config = {**job.config, "train": dict(settings), "learning": dict(job.learning)}
     resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
     folder.mkdir(parents=True, exist_ok=True)
     run, lock = claim_run(folder, True, resume, full_config)
     with ExitStack() as resources:
         resources.push(lock)  # it is held already
-        policy = build(config)
-        if tower_seed not in (None, int(config["seed"])):
-            copy_tower(build({**config, "seed": tower_seed}), policy)
-        samples, val_set = prepared(policy, tokens or folder, files, learning, int(config["seed"]))
-        policy.config[TRAINING] = identify(full_config, content_of(files))
-        policy.config["card"] = {"data": f"{len(files)} demonstrations", "recipe": dict(settings)}
+        policy = build(job.config)
+        if job.tower_seed != int(job.config["seed"]):
+            copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
+        samples, val_set = prepared(policy, job)
+        policy.config[TRAINING] = identify(full_config, content_of(job.files))
+        policy.config["card"] = {"data": f"{len(job.files)} demonstrations", "recipe": dict(settings)}
         validation = Validation(
             val_set, val_set.collate, train_settings.val_samples, train_settings.batch_size, train_settings.seed
         )
+        cost = measured_cost(policy, samples, train_settings.batch_size)
         trainer = Trainer(
             policy, samples, samples.collate, validation, train_settings, run, full_config, Accelerator(cpu=True)
         )
         line, loggers = ProgressLine(train_settings.steps, run.step), open_loggers(folder, {}, run.step)
-        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(files)} demonstrations")
+        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(job.files)} demonstrations")
+        updating = time.process_time()
         try:
             with line:
                 finished = trainer.run(line, loggers)
@@ -146,12 +146,55 @@ def train(
     assert trainer.last_checkpoint is not None
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
-    off = position_error(MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval(), val_set)
-    spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
+    updates = train_settings.steps - run.step
+    spent = {
+        "update_s": (time.process_time() - updating) / updates if updates else None,
+        "minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60,
+    }  # fmt: skip
+    learned = MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval()
+    (folder / ROW_CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8")
     write_json(
-        folder / DONE, {"steps": train_settings.steps, "decisions": len(samples), "off_by_m": off.tolist(), **spent}
+        folder / DONE, summary(job, learned, len(samples.tasks)) | cost | spent | held_out(learned, val_set, folder)
     )
     return trainer.last_checkpoint
+
+
+def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
+    """What was trained on what, as `trained.json` says it."""
+    identity, memory = identity_of(policy.config), policy.config.get("memory")
+    integration = policy.config.get("integration")
+    return {
+        "row": job.row, "kind": "policy", "trained": True, "seed": int(job.config["seed"]),
+        "steps": job.settings["steps"], "updates": job.settings["steps"], "batch_size": job.settings["batch_size"],
+        "decisions": decisions, "demonstrations": dict(Counter(file.parent.name for file in job.files)),
+        **{name: getattr(identity, name) for name in ("data", "recipe", "weights")}, "tower": job.store.tower,
+        "memory": memory["name"] if memory else None, "integration": integration["name"] if integration else None,
+        "budget": policy.memory.budget if policy.memory is not None else None,
+    }  # fmt: skip
+
+
+def measured_cost(policy: MMEPolicy, samples: Decisions, batch_size: int) -> dict[str, Any]:
+    """Learned parameters, and the floating-point operations of an update and of a decision on ready tokens."""
+    batch = samples.collate([samples[i % len(samples)] for i in range(batch_size)])
+    with FlopCounterMode(display=False) as update:
+        policy.train()(batch)[0].backward()
+    policy.zero_grad(set_to_none=True)
+    with FlopCounterMode(display=False) as decision:
+        policy.eval().sample_actions(samples.collate([samples[0]]))
+    return {
+        "parameters": sum(p.numel() for p in policy.parameters() if p.requires_grad),
+        "update_flops": update.get_total_flops(), "decision_flops": decision.get_total_flops(),
+    }  # fmt: skip
+
+
+def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, Any]:
+    """How a trained policy does on demonstrations that it did not learn from."""
+    losses = [(line["val/loss"], line["step"]) for line in learning_curve(folder) if "val/loss" in line]
+    best = {"val_loss": losses[-1][0] if losses else None, "best_update": min(losses)[1] if losses else None}
+    if policy.embodiment.action.choice:
+        errors = choice_errors(policy, val_set)
+        return best | {"accuracy": errors.accuracy, "off_by": errors.off_by, "off_by_m": None}
+    return best | {"accuracy": None, "off_by": None, "off_by_m": position_error(policy, val_set).tolist()}
 
 
 def content_of(files: Sequence[Path]) -> list[str]:
@@ -164,36 +207,22 @@ def content_of(files: Sequence[Path]) -> list[str]:
     return digests
 
 
-def prepared(
-    policy: MMEPolicy, folder: Path, files: Sequence[Path], learning: Mapping[str, Any], seed: int = 0
-) -> tuple[Decisions, Decisions]:
-    """Decisions to learn from, and to measure by; their tokens, and the statistics, are made once for a folder.
-
-    With history transforms the tokens of all frames stay in memory, and are made anew for each training. seed: of these
-    transforms, which do not change the decisions to measure by.
-    """
-    learnt_file, val_file, stats_file = (
-        folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
-    )
-    options = {"oversample": learning["often"], "noise": learning["noise"], "token_noise": learning["blur"]}
-    processor = policy.require_processor()
-    transforms = build_transforms(learning.get("history_transforms"))
-    if val_file.is_file() and not transforms:  # written last
-        processor.stats = NormStats.load(stats_file)
-        return Decisions.load(learnt_file, **options), Decisions.load(val_file)
+def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
+    """Decisions to learn from, and to measure by, which history transforms do not change."""
+    learning, files = job.learning, job.files
     learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
+    measured = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
+    processor = policy.require_processor()
     processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
-    processor.stats.save(stats_file)
-    distance = learning["elsewhere"]
+
+    def read(some: Sequence[Path]) -> Iterator[tuple[Demonstration, FrameTokens]]:
+        return ((Demonstration.load(file, images=False), job.store.read(file)) for file in some)
+
     samples = Decisions.of(
-        policy, map(Demonstration.load, learnt), min_distance=distance, transforms=transforms, seed=seed, **options
-    )
-    held_out = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
-    val_set = Decisions.of(policy, map(Demonstration.load, held_out), min_distance=distance)
-    if not transforms:
-        samples.save(learnt_file)
-        val_set.save(val_file)
-    return samples, val_set
+        policy, read(learnt), learning["elsewhere"], build_transforms(learning.get("history_transforms")),
+        int(job.config["seed"]), oversample=learning["often"], noise=learning["noise"], token_noise=learning["blur"],
+    )  # fmt: skip
+    return samples, Decisions.of(policy, read(measured), learning["elsewhere"])
 
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:

@@ -1,9 +1,8 @@
-"""Training on demonstrations of planned motions: every decision is a sample, and its tokens are computed beforehand."""
+"""Training on demonstrations of motions or choices: every decision is a sample, of tokens made beforehand."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,22 +10,21 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from mme_vla.backbone.siglip import pool_grid
+from mme_vla.embodiment.action_space import MIDDLE
 from mme_vla.errors import require
-from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
+from mme_vla.memory.base import Memory, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.memory.transforms import HistoryTransform, TransformedHistory, map_frames
 from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.nano.tokens import FrameTokens, tokenize
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
 from mme_vla.types import Batch, HistoryTokens, stack_noise
-from mme_vla.utils import write_atomically
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
-
-
-_PAST = "history."
 JOINT_NOISE = 0.05
 MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
 
@@ -34,21 +32,14 @@ MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to a
 class SparseHistory(History):
     """The tokens of some of an episode's frames; any other frame is refused.
 
-    tokens: frame → [patches, d_vision].
+    length: of the episode. frames: [n] ascending. tokens: [n, patches, d_vision].
     """
 
     def __init__(
-        self,
-        spec: StorageSpec,
-        length: int,
-        tokens: Mapping[int, Tensor],
-        exec_start: int,
-        scores: FrameScores | None = None,
+        self, spec: StorageSpec, length: int, frames: np.ndarray, tokens: Tensor, exec_start: int, scores: FrameScores
     ) -> None:
         super().__init__(spec, exec_start)
-        self._scores = FrameScores.empty(spec.grid**2) if scores is None else scores
-        self._length, self._frames = length, np.array(sorted(tokens), np.int64)
-        self._tokens = torch.stack([tokens[int(frame)] for frame in self._frames])
+        self._length, self._frames, self._tokens, self._scores = length, frames, tokens, scores
 
     def __len__(self) -> int:
         return self._length
@@ -95,6 +86,7 @@ class Decisions(Dataset[int]):
 
     batch: every decision, or every so many where the robot executes more motions of a chunk than one; the tokens of
         the current images (`Batch.view_tokens`) stand in place of the images.
+    tasks: [n]; of which task each is.
     distant: [n] bool; decisions on a motion to another place than the last one's, which are hard and few: each is
         an item `oversample` times.
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
@@ -109,12 +101,13 @@ class Decisions(Dataset[int]):
         self,
         batch: Batch,
         distant: Tensor,
+        tasks: Sequence[str],
         oversample: int = 1,
         noise: float = 0.0,
         token_noise: float = 0.0,
         replay: Replay | None = None,
     ) -> None:
-        self.replay = replay
+        self.replay, self.tasks = replay, tasks
         self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, oversample, 1))
 
@@ -122,57 +115,34 @@ class Decisions(Dataset[int]):
     def of(
         cls,
         policy: MMEPolicy,
-        demonstrations: Iterable[Demonstration],
-        oversample: int = 1,
+        demonstrations: Iterable[tuple[Demonstration, FrameTokens]] | Iterable[Demonstration],
         min_distance: float = MIN_DISTANCE,
-        noise: float = 0.0,
-        token_noise: float = 0.0,
         transforms: Sequence[HistoryTransform] = (),
         seed: int = 0,
+        **options: Any,
     ) -> "Decisions":
-        """Make all tokens, of one demonstration after the other: their images together are gigabytes.
+        """Select what a policy reads at each decision.
 
-        policy: with the vision weights it trains with, and statistics. min_distance: metres from which on a motion
-        leads to another place. transforms: of a demonstration's frames, chosen by `seed` and epoch. The others: see the
-        class.
+        policy: with statistics. demonstrations: with the tokens of their frames; alone they are encoded now.
+        min_distance: metres from which on a motion leads to another place. transforms: of a demonstration's frames,
+        chosen by `seed` and epoch. options: see the class.
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
         rows: list[tuple[History, int]] = []
-        for demonstration in demonstrations:
-            history = _history(policy, demonstration)
-            items += _items(policy, demonstration, history)
+        tasks: list[str] = []
+        for entry in demonstrations:
+            demonstration, made = (entry, tokenize(policy, entry)) if isinstance(entry, Demonstration) else entry
+            history = _history(policy, demonstration, made)
+            new = _items(policy, demonstration, history, made)
+            items += new
+            tasks += [demonstration.task] * len(new)
             if history is not None and transforms:
                 rows += [(history, frame) for frame in _decisions(policy, demonstration)]
             distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
         require(items, "The demonstrations hold no decision to learn from.")
         replay = Replay(policy.require_memory(), rows, transforms, seed) if rows else None
-        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise, replay)
-
-    @classmethod
-    def load(cls, path: Path, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0) -> "Decisions":
-        """Read what `save` wrote."""
-        from safetensors.torch import load_file
-
-        tensors = load_file(path)
-        distant = tensors.pop("far")
-        names = [name for name in tensors if name.startswith(_PAST)]
-        past: dict[str, Any] = {name.removeprefix(_PAST): tensors[name] for name in names}
-        now: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith(_PAST)}
-        batch = Batch(**now, history=HistoryTokens(**past) if past else None)
-        return cls(batch, distant, oversample, noise, token_noise)
-
-    def save(self, path: Path) -> None:
-        """Write one file of tensors, whole or not at all."""
-        from safetensors.torch import save_file
-
-        values = {name: value for name, value in vars(self.batch).items() if isinstance(value, Tensor)}
-        values["far"] = self.distant
-        if self.batch.history is not None:
-            past = vars(self.batch.history).items()
-            values |= {f"{_PAST}{name}": value for name, value in past if isinstance(value, Tensor)}
-        with write_atomically(path) as draft:
-            save_file({name: value.contiguous() for name, value in values.items()}, draft)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), tasks, replay=replay, **options)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -225,15 +195,49 @@ def _distant(targets: np.ndarray, min_distance: float) -> np.ndarray:
 
 
 @torch.no_grad()
+def _predicted(policy: MMEPolicy, val_set: Decisions, rows: Sequence[int], seed: int) -> tuple[Tensor, Tensor]:
+    """The first action of each chunk, as it is predicted and as it should be: [n, w] each, absolute."""
+    generator, processor = torch.Generator().manual_seed(seed), policy.require_processor()
+    pairs = []
+    for start in range(0, len(rows), 64):
+        batch = val_set.collate(rows[start : start + 64])
+        assert batch.actions is not None and batch.state is not None
+        noise = stack_noise([policy.sampling_noise(generator) for _ in range(len(batch.prompt))])
+        chunk = policy.sample_actions(batch, noise).float()
+        pairs.append([processor.absolute_actions(x, batch.state)[:, 0] for x in (chunk, batch.actions)])
+    predicted, recorded = (torch.cat(side) for side in zip(*pairs, strict=True))
+    return predicted, recorded
+
+
 def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tensor:
     """How far above the table motions to another place end from where they should, the first of each chunk; [n] m."""
     rows = val_set.distant.nonzero()[:, 0].tolist()
-    batch, generator = val_set.collate(rows), torch.Generator().manual_seed(seed)
-    assert batch.actions is not None and batch.state is not None
-    chunk = policy.sample_actions(batch, stack_noise([policy.sampling_noise(generator) for _ in rows])).float()
-    processor = policy.require_processor()
-    predicted = processor.absolute_actions(chunk, batch.state)
-    return (predicted - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
+    predicted, recorded = _predicted(policy, val_set, rows, seed)
+    return (predicted - recorded)[:, :2].norm(dim=1)
+
+
+@dataclass(frozen=True)
+class ChoiceErrors:
+    """Of held-out choices. accuracy: task → share of right letters. off_by: median distance of points, in shares of the
+    image's side, where a point is needed; None where none is.
+    """
+
+    accuracy: dict[str, float]
+    off_by: float | None
+
+
+def choice_errors(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> ChoiceErrors:
+    """How often the letter of a decision is right, and how far off its point is."""
+    space = policy.embodiment.action
+    predicted, recorded = _predicted(policy, val_set, range(len(val_set.tasks)), seed)
+    letters = list(space.choice)
+    right = (predicted[:, letters].argmax(1) == recorded[:, letters].argmax(1)).numpy()
+    tasks = np.array(val_set.tasks)
+    points = recorded[:, list(space.point)]
+    needed = (points - torch.tensor(MIDDLE)).abs().amax(1) > 1e-6
+    off = (predicted[:, list(space.point)] - points)[needed].norm(dim=1)
+    accuracy = {task: float(right[tasks == task].mean()) for task in dict.fromkeys(val_set.tasks)}
+    return ChoiceErrors(accuracy, float(off.median()) if len(off) else None)
 
 
 def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:
@@ -253,13 +257,12 @@ def _widened(stats: QuantileStats) -> QuantileStats:
     return replace(stats, q01=middle - half, q99=middle + half)
 
 
-@torch.no_grad()
-def _items(policy: MMEPolicy, demonstration: Demonstration, history: History | None) -> list[dict[str, Any]]:
+def _items(
+    policy: MMEPolicy, demonstration: Demonstration, history: History | None, made: FrameTokens
+) -> list[dict[str, Any]]:
     processor, cameras = policy.require_processor(), policy.embodiment.camera_names
     decisions = _decisions(policy, demonstration)
-    views = processor.images([np.stack([demonstration.images[name][frame] for frame in decisions]) for name in cameras])
-    flat = views.flatten(0, 1).float() / 255 * 2 - 1
-    view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
+    view_tokens = torch.stack([made.at(name, decisions) for name in cameras], 1)
     subgoals = _subgoals(policy, demonstration)[:: policy.embodiment.action.execute]
     items = []
     for place, frame in enumerate(decisions):
@@ -281,18 +284,16 @@ def _decisions(policy: MMEPolicy, demonstration: Demonstration) -> list[int]:
     return [int(frame) for frame in demonstration.motions.decisions[:: policy.embodiment.action.execute]]
 
 
-@torch.no_grad()
-def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
+def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens) -> History | None:
     if policy.memory is None:
         return None
-    images = demonstration.images[policy.embodiment.memory_camera]
-    decisions = demonstration.motions.decisions[:: policy.embodiment.action.execute]
-    read = policy.frames_read(decisions, demonstration.exec_start).tolist()
-    taken = {frame: images[frame] for frame in read if frame in images} or images
-    tokens = policy.encode_frames(np.stack(list(taken.values())))
+    memory, camera = policy.memory, policy.embodiment.memory_camera
+    read = policy.frames_read(np.array(_decisions(policy, demonstration)), demonstration.exec_start)
+    frames = np.intersect1d(read, made.frames[camera])
+    tokens = pool_grid(made.at(camera, frames).float(), memory.storage.grid, memory.storage.pooling)
     history = SparseHistory(
-        policy.memory.storage, demonstration.length, dict(zip(taken, tokens, strict=True)), demonstration.exec_start,
-        _scores(policy.memory, taken),
+        memory.storage, demonstration.length, frames, tokens.to(policy.history_dtype), demonstration.exec_start,
+        made.scores.get(memory.storage.scorer) or FrameScores.empty(memory.storage.grid**2),
     )  # fmt: skip
     if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
         nothing = np.zeros((demonstration.length, policy.embodiment.action.width), np.float32)
@@ -304,16 +305,6 @@ def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
         )
         history.motion, history.state_width = motion.__getitem__, policy.embodiment.state.width
     return history
-
-
-def _scores(memory: Memory, images: Mapping[int, np.ndarray]) -> FrameScores:
-    """The scores of these frames by the memory's scorer, as in an episode."""
-    scorer = make_scorer(memory)
-    scores = {} if scorer is None else {frame: scorer(frame, images[frame]) for frame in sorted(images)}
-    rows = {frame: values for frame, values in scores.items() if values is not None}
-    if not rows:
-        return FrameScores.empty(memory.storage.grid**2)
-    return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
 
 
 def _subgoals(policy: MMEPolicy, demonstration: Demonstration) -> Sequence[str | None]:

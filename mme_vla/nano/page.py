@@ -11,8 +11,8 @@ from mme_vla.evaluation.results.aggregate import Interval, Method, Results, aggr
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
-from mme_vla.nano.evaluating import NAME as PLANNER
-from mme_vla.nano.fitting import DONE, learning_curve, training_folders
+from mme_vla.nano.evaluating import PLANNER
+from mme_vla.nano.fitting import DONE, learning_curve
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
 
@@ -27,16 +27,14 @@ def write_page(
     without: str | None,
     minutes: Mapping[str, Sequence[float]],
     videos: Sequence[Path],
+    runs: Mapping[str, Sequence[Path]],
 ) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
     records: of each model, the one with memory first, and of the oracle planner. without: the one without memory, which
     all others are compared with. minutes: of each stage, on the clock and of processors. videos: one of a success, one
-    of a failure, as far as there are such.
+    of a failure, as far as there are such. runs: of each model, the folders of its trainings.
     """
-    runs = {
-        model: training_folders(folder / model, config.get("trainings", 1)) for model in records if model != PLANNER
-    }
     ends = {model: [read_json(run / DONE, "a training's end") for run in folders] for model, folders in runs.items()}
     results, comparisons = compared(records, config["task"], config["split"], without)
     curves = {
@@ -48,7 +46,7 @@ def write_page(
         "nano.md",
         config=config,
         demonstrations=sum(config["demonstrations"].values()),
-        seeds=", ".join(map(str, config["policy_seeds"])),
+        seeds=str(config["policy_seed"]),
         planner=PLANNER,
         without=without,
         success=success_table(records, ends, results),
@@ -110,7 +108,8 @@ def success_table(
             deviation, interval = f" ± {average.std:.0f}", Interval(*(value / 100 for value in average.interval))
         success = f"{100 * rate:.0f}{deviation} % ({cells[0]})"
         confidence = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
-        off = np.concatenate([end["off_by_m"] for end in ends[model]]) if model in ends else None
+        measured = [end["off_by_m"] for end in ends.get(model, ()) if end["off_by_m"] is not None]
+        off = np.concatenate(measured) if measured else None
         errors = ("", "") if off is None else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
         row = (model_records[0].model, model_records[0].memory_budget or "", success, confidence, *cells[1:], *errors)
         lines.append("| " + " | ".join(map(str, row)) + " |")

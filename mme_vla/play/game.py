@@ -230,6 +230,7 @@ class ChoiceSession:
             self.options = tuple(
                 Option(str(option["label"]).lower(), str(option["action"]), bool(option["need_parameter"]))
                 for option in info["available_multi_choices"]
+                if option.get("possible", True)
             )
         self._displayed_at = self._clock()
 

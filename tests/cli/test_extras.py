@@ -79,8 +79,8 @@ SUFFICE = [
     Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
     Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
-    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
-                   "output=tower", "nano_vision.safetensors", draws=True),
+    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 held_out=1 arrangements=1 steps=1 "
+                   "batch_size=1 output=tower", "nano_tower.safetensors", draws=True),
     Case(("sim",), "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
          "recorded: 1 episodes", draws=True),
     Case(("sim",), "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
@@ -211,7 +211,7 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
     assert code == case.code and case.says in output, output[-3000:]
     if case.words.endswith(NANO):  # run again, it computes nothing twice
         nano = folder / "nano"
-        records = read_folders(find_records([nano / "framesamp_modul"]))
+        records = read_folders(find_records([nano / "val" / "framesamp_modul"]))
         assert sorted(record.episode for record in records) == [0, 1]
         assert {record.action_space for record in records} == {"waypoint"}
         page = (nano / "page.md").read_text()
@@ -221,7 +221,7 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
         saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
         assert run(case, folder)[0] == 0
         assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == saved
-        assert len(read_folders(find_records([nano / "framesamp_modul"]))) == 2
+        assert len(read_folders(find_records([nano / "val" / "framesamp_modul"]))) == 2
 
 
 @pytest.mark.slow

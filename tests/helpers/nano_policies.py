@@ -10,10 +10,10 @@ from mme_vla.policy.mme import MMEPolicy
 EVERY_EIGHTH = {"budget": 256, "grid": 8, "every": 8}
 
 
-def nano(model: str = "framesamp_modul") -> MMEPolicy:
+def nano(model: str = "framesamp_modul", **others: object) -> MMEPolicy:
     memory = {"memory": EVERY_EIGHTH} if model.startswith("framesamp") else {}
     words = {"backbone": "nano", "embodiment": "robomme_waypoint_front", "policy": {"augment": False}}
-    return build_policy(model, **words, **memory)
+    return build_policy(model, **words, **memory, **others)
 
 
 def demonstration(frames: tuple[int, ...] = (0, 15, 39, 47, 63, 66, 79, 95, 119, 120, 151, 155)) -> Demonstration:

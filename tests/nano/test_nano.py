@@ -1,7 +1,6 @@
 """The nano backbone, its tower and its tokens; and what stands between demonstrations and training."""
 
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,12 @@ import pytest
 import torch
 
 from helpers.nano_policies import demonstration, nano
-from mme_vla import UserError, build_policy
-from mme_vla.backbone.nano_vision import CLASSES, WEIGHTS
+from mme_vla import UserError
 from mme_vla.cli import nano as nano_command
-from mme_vla.cli.nano import check_counts, with_settings
+from mme_vla.cli.nano import with_settings
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
+from mme_vla.nano.runs import counts_of
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing import check_backbone
 
@@ -27,24 +26,6 @@ SMALL = {
 
 def test_it_keeps_a_backbones_contract() -> None:
     check_backbone("nano", **SMALL)
-
-
-def test_the_shipped_tower_weighs_under_six_megabytes_and_other_sizes_are_refused() -> None:
-    assert len(files("mme_vla").joinpath(WEIGHTS).read_bytes()) < 6e6
-    with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
-        build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})
-
-
-def test_the_shipped_tower_names_what_is_where() -> None:
-    """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far from it."""
-    tower = nano("pi05").backbone.vision
-    image = torch.full((1, 3, 128, 128), 0.3)
-    image[0, :, 52:60, 66:74] = torch.tensor([0.7, -0.9, -0.9])[:, None, None]
-    with torch.no_grad():
-        shares = tower.answers(image)[0].softmax(2)[0]  # token, class, place
-    red = shares[:, CLASSES.index("red cube")].amax(-1).view(8, 8)
-    assert red.argmax() == 3 * 8 + 4 and red[3, 4] > 0.5
-    assert shares[:, CLASSES.index("green cube")].max() < 0.5
 
 
 def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
@@ -72,24 +53,19 @@ def test_tokens_made_beforehand_give_the_loss_of_the_images() -> None:
     draws = policy.training_noise(3, torch.Generator().manual_seed(0))
     with torch.no_grad():
         ready, from_images = policy(batch, draws)[0], policy(replace(batch, images=images, view_tokens=None), draws)[0]
-    assert torch.allclose(ready, from_images, atol=1e-5)
+    assert torch.allclose(ready, from_images, atol=1e-3)  # tokens are kept as float16
 
 
-def test_decisions_are_read_as_they_were_saved(tmp_path: Path) -> None:
-    policy = nano()
-    policy.require_processor().stats = statistics([demonstration()], policy)
-    made = Decisions.of(policy, [demonstration()])
-    made.save(tmp_path / "a.safetensors")
-    pairs = zip(made.batch.tensors(), Decisions.load(tmp_path / "a.safetensors").batch.tensors(), strict=True)
-    assert all(torch.equal(a, b) for a, b in pairs)
-
-
-@pytest.mark.parametrize(
-    ("counts", "words"), [({"easy": 1}, "takes two"), ({"simple": 4}, "easy"), (30, "how many of each"), ({}, "two")]
-)
+@pytest.mark.parametrize(("counts", "words"), [({"easy": 1}, "takes two"), ({"simple": 4}, "easy"), ({}, "two")])
 def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        check_counts(counts)
+        counts_of({"task": "StopCube", "demonstrations": counts, "demonstrations_of": {}})
+    more = {
+        "task": ["StopCube", "BinFill"],
+        "demonstrations": {"easy": 2},
+        "demonstrations_of": {"BinFill": {"hard": 1}},
+    }
+    assert counts_of(more) == {("StopCube", "easy"): 2, ("BinFill", "easy"): 2, ("BinFill", "hard"): 1}
 
 
 def test_a_tasks_settings_come_with_its_name_unless_others_are_named(
@@ -97,10 +73,11 @@ def test_a_tasks_settings_come_with_its_name_unless_others_are_named(
 ) -> None:
     (tmp_path / "nano").mkdir()
     (tmp_path / "nano" / "StopCube.yaml").touch()
+    (tmp_path / "nano" / "nano16.yaml").touch()
     monkeypatch.setattr(nano_command, "config_dir", lambda: tmp_path)
     assert with_settings(["task=StopCube", "seed=1"]) == ["nano=StopCube", "task=StopCube", "seed=1"]
-    assert with_settings(["model=ttt_modul"]) == ["with_memory=ttt_modul"]
-    for words in (["task=BinFill"], ["seed=1"], ["task=StopCube", "nano=mine"]):
+    assert with_settings(["model=ttt_modul"]) == ["nano=nano16", "with_memory=ttt_modul", "also=[]"]
+    for words in (["task=BinFill"], ["task=StopCube", "nano=mine"]):
         assert with_settings(words) == words
     assert with_settings(["task=StopCube", "nano=null"]) == ["task=StopCube"]
 
@@ -115,11 +92,25 @@ def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
     assert policy.act(episode).shape == (4, 7)
 
 
-def test_what_the_goal_names_first_is_highlighted_in_images_and_memory() -> None:
-    backbone, processor = nano().backbone, nano().require_processor()
+def test_policies_of_earlier_versions_highlight_what_the_goal_names_first_in_images_and_memory() -> None:
+    policy = MMEPolicy.from_pretrained("nano")
+    assert policy.backbone.config.goal == "swap"
+    backbone, processor = policy.backbone, policy.require_processor()
     ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
     unmarked, unmarked_mask = processor.prompt("press the button")
     tokens = torch.arange(96.0).expand(2, 3, 96)
     annotated = backbone.condition_on_prompt(tokens, torch.stack([ids, unmarked]), torch.stack([mask, unmarked_mask]))
     assert annotated[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
     assert torch.equal(annotated[1], tokens[1])
+
+
+def test_the_goal_weighs_what_is_seen_by_its_words_and_not_by_what_is_behind_them() -> None:
+    policy = nano("pi05")
+    backbone, processor = policy.backbone, policy.require_processor()
+    goals = ["pick up the red cube", "pick up the green cube"]
+    ids, masks = (torch.stack(part) for part in zip(*map(processor.prompt, goals), strict=True))
+    tokens = torch.ones(2, 3, backbone.vision_width)
+    with torch.no_grad():
+        read = backbone.condition_on_prompt(tokens, ids, masks)
+        padded = backbone.condition_on_prompt(tokens, torch.where(masks, ids, 7), masks)
+    assert torch.equal(read, padded) and not torch.allclose(read[0], read[1])

@@ -9,7 +9,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
-from mme_vla.nano.evaluating import Replay, replay
+from mme_vla.nano.evaluating import replay
 
 SCENE = {"seed": 3_000_001, "difficulty": "easy"}
 
@@ -35,6 +35,6 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> 
 def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:
     pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
     spec = metadata.episode("VideoUnmask", "val", 0)
-    record = replay(Replay(spec, max_steps=500))
+    record = replay(spec, max_steps=500)
     assert (record.model, record.outcome, record.seed) == ("planner", "success", spec.seed)
-    assert replay(Replay(spec, max_steps=record.steps // 2)).outcome == "timeout"
+    assert replay(spec, max_steps=record.steps // 2).outcome == "timeout"

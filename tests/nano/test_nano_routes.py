@@ -1,6 +1,5 @@
 """Policies that execute several motions of a chunk are asked at every so many decisions, and learn those alone."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -54,12 +53,10 @@ def test_a_route_decided_at_once_needs_the_frames_before_it_alone() -> None:
         Decisions.of(routed, [demonstration([0, 7, 20])])
 
 
-def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are(tmp_path: Path) -> None:
+def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are() -> None:
     routed, made = policy(1), demonstration(range(120))
     routed.require_processor().stats = statistics([made], routed)
-    sharp = Decisions.of(routed, [made])
-    sharp.save(tmp_path / "a.safetensors")
-    blurred = Decisions.load(tmp_path / "a.safetensors", token_noise=0.5)
+    sharp, blurred = (Decisions.of(routed, [made], token_noise=size) for size in (0.0, 0.5))
     now, same, other = blurred.collate([0, 1, 2]), blurred.collate([0, 1, 2]), blurred.collate([2, 1, 0])
     batch = sharp.collate([0, 1, 2])
     assert now.view_tokens is not None and batch.view_tokens is not None and now.history is not None

@@ -8,14 +8,15 @@ import torch
 
 from helpers.nano_policies import demonstration
 from mme_vla import UserError, build_policy
-from mme_vla.cli.nano import demonstrate
 from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.nano import demonstrations
+from mme_vla.nano import demonstrations, tokens
 from mme_vla.nano.demonstrations import Demonstration, Scene
 from mme_vla.nano.fitting import DONE
 from mme_vla.nano.learning import Decisions, position_error, statistics
 from mme_vla.nano.page import write_page
+from mme_vla.nano.runs import Group, demonstrate
+from mme_vla.nano.tokens import TokenStore
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import write_json
 
@@ -87,6 +88,32 @@ def test_the_error_is_measured_where_the_arm_goes_to_another_place(monkeypatch: 
     assert position_error(policy, decisions).allclose(torch.full((int(decisions.distant.sum()),), half), atol=1e-4)
 
 
+def test_tokens_are_made_once_for_a_tower_and_again_for_other_frames_or_scores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    encoded: list[int] = []
+    original = tokens.tokenize
+
+    def counted(policy: MMEPolicy, made: Demonstration, *others: object) -> tokens.FrameTokens:
+        encoded.append(len(made.images["front"]))
+        return original(policy, made, *others)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tokens, "tokenize", counted)
+    file = tmp_path / "VideoUnmask" / "easy-3.npz"
+    file.parent.mkdir()
+    demonstration().save(file)
+    plain = TokenStore.of(tmp_path / "tokens", [nano("framesamp_modul").config, nano("pi05").config])
+    read = plain.read(file)
+    assert read.tokens["front"].shape == (12, 64, 96) and not read.scores and len(plain.read(file).frames) == 1
+    assert encoded == [12]
+    scored = TokenStore.of(tmp_path / "tokens", [nano("tokendrop_modul").config])
+    policy = nano("tokendrop_modul")
+    rows = scored.read(file).scores[policy.require_memory().storage.scorer]
+    assert rows.frames.tolist() == [15, 39, 47, 63, 79, 95, 119, 151] and encoded == [12, 12]
+    demonstration((0, 15, 66, 120, 155)).save(file)
+    assert scored.read(file).frames["front"].tolist() == [0, 15, 66, 120, 155] and encoded == [12, 12, 5]
+
+
 def scenes(folder: Path, count: int, *choices: FrameChoice) -> list[Scene]:
     return [Scene("VideoUnmask", seed, "easy", folder, ("front",), choices) for seed in range(count)]
 
@@ -101,18 +128,22 @@ def test_scenes_are_demonstrated_until_there_are_enough_and_once(
         return None if seed == 1 else demonstration()
 
     monkeypatch.setattr(demonstrations, "record", record)
-    results = demonstrate(iter(scenes(tmp_path, 9)), 3)
+
+    def demonstrated(count: int, *choices: FrameChoice) -> list[Path]:
+        return demonstrate([Group(iter(scenes(tmp_path, 9, *choices)), count)])
+
+    results = demonstrated(3)
     assert [path.stem for path in results] == ["easy-0", "easy-2", "easy-3"] and tried == [0, 1, 2, 3]
-    assert demonstrate(iter(scenes(tmp_path, 9)), 3) == results and tried == [0, 1, 2, 3]
+    assert demonstrated(3) == results and tried == [0, 1, 2, 3]
     other_memory = FrameChoice(DECISIONS, {"name": "framesamp", "budget": 4, "grid": 1, "every": 4})
-    demonstrate(iter(scenes(tmp_path, 9, other_memory)), 1)
+    demonstrated(1, other_memory)
     assert tried == [0, 1, 2, 3, 0], "a demonstration without the frames of a new memory is made again"
 
 
 def test_scene_after_scene_without_a_demonstration_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demonstrations, "record", lambda *_: None)
     with pytest.raises(UserError, match="20 easy scenes in a row, to seed 19"):
-        demonstrate(iter(scenes(tmp_path, 40)), 3)
+        demonstrate([Group(iter(scenes(tmp_path, 40)), 3)])
 
 
 def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Path) -> None:
@@ -128,14 +159,15 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         (tmp_path / model / "metrics.jsonl").write_text('{"step": 10, "val/loss": 0.5}\n')
     config = {
         "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4}, "train": {"steps": 20},
-        "policy_seeds": [7],
+        "policy_seed": 7,
     }  # fmt: skip
     video = tmp_path / "films" / "a.mp4"
     runs = {
         "framesamp_modul": records("framesamp_modul", 60, 100, 4), "pi05": records("pi05", 5, 100),
         "ttt_modul": records("ttt_modul", 20, 50, 4), "planner": records("planner", 100, 100),
     }  # fmt: skip
-    page = write_page(tmp_path, config, runs, "pi05", {"videos": [2.0, 1.0]}, [video]).read_text()
+    folders = {model: [tmp_path / model] for model in runs if model != "planner"}
+    page = write_page(tmp_path, config, runs, "pi05", {"videos": [2.0, 1.0]}, [video], folders).read_text()
     assert "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
     assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page

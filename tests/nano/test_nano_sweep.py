@@ -7,22 +7,23 @@ from typing import Any
 import pytest
 
 from helpers.nano_policies import demonstration
-from mme_vla.cli import nano as command
 from mme_vla.cli.nano import with_settings
 from mme_vla.config.composition import compose, resolved
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.nano import evaluating, fitting, learning
+from mme_vla.nano import evaluating, fitting, runs, tokens
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.training_identity import identity_of
+from mme_vla.utils import read_json
 
 FRAMES = tuple(range(0, 160))
 
 
 def test_models_and_budgets_are_lists_of_one_run() -> None:
     words = with_settings(["--multirun", "model=a,b,c", "budget=4,16", "trainings=2"])
-    assert words == ["with_memory=[a,b,c]", "budget=[4,16]", "trainings=2", "also=[]"]
-    assert with_settings(["-m", "model=a", "seed=0,1"]) == ["-m", "with_memory=a", "seed=0,1"]
+    assert words == ["nano=nano16", "with_memory=[a,b,c]", "budget=[4,16]", "trainings=2", "also=[]"]
+    swept = with_settings(["-m", "task=VideoUnmask", "model=a", "seed=0,1"])
+    assert swept[1:] == ["-m", "task=VideoUnmask", "with_memory=a", "seed=0,1", "also=[]"]
     assert "--multirun" in with_settings(["--multirun", "model=a,b", "seed=0,1"])
 
 
@@ -30,24 +31,20 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = []
+    (tmp_path / "VideoUnmask").mkdir()
     for number in range(2):
-        files.append(tmp_path / f"easy-{number}.npz")
+        files.append(tmp_path / "VideoUnmask" / f"easy-{number}.npz")
         demonstration(FRAMES).save(files[-1])
     recorded: list[Any] = []
-    monkeypatch.setattr(command, "record_all", lambda *args: recorded.append(args) or files)
+    monkeypatch.setattr(runs, "record_all", lambda *args: recorded.append(args) or files)
     made: list[Any] = []
-    original = learning.Decisions.of.__func__  # type: ignore[attr-defined]
+    original = tokens.tokenize
+    monkeypatch.setattr(tokens, "tokenize", lambda *args: made.append(args) or original(*args))
 
-    def of(cls: Any, policy: Any, *args: Any, **options: Any) -> Any:
-        made.append(policy.require_memory().budget)
-        return original(cls, policy, *args, **options)
-
-    monkeypatch.setattr(learning.Decisions, "of", classmethod(of))
-
-    def episodes(checkpoint: Path, folder: Path, task: str, **_: Any) -> list[EpisodeRecord]:
+    def episodes(checkpoint: Path, *_: Any) -> list[EpisodeRecord]:
         policy = MMEPolicy.from_pretrained(str(checkpoint))
         return [
-            EpisodeRecord(str(policy.config["name"]), 2, 7, task, n, n, "easy", "success" if n else "fail", 9,
+            EpisodeRecord(str(policy.config["name"]), 2, 7, "VideoUnmask", n, n, "easy", "success" if n else "fail", 9,
                           split="further", training=identity_of(policy.config),
                           memory_budget=policy.require_memory().budget) for n in range(2)
         ]  # fmt: skip
@@ -56,16 +53,20 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul,tokendrop_modul", "budget=2,4"])
     words += ["trainings=2", "beside=[]", "drawn_for=[]", "planner=false", "films=false", f"output={tmp_path / 'run'}"]
     words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]
-    page = command.run(resolved(compose("nano", words))).read_text()
-    assert len(recorded) == 1 and made == [2, 2, 4, 4, 2, 2, 4, 4]  # to learn from and to measure by
+    page = runs.run(resolved(compose("nano", words))).read_text()
+    assert len(recorded) == 1 and len(made) == 2, "each frame is encoded once"
     for name in ("framesamp_modul-every_8-grid_1", "tokendrop_modul-grid_1"):
         assert all(f"| {name} | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
-    assert len(list((tmp_path / "run").glob("*/training_*/trained.json"))) == 8
-    seeds = [identity_of(MMEPolicy.from_pretrained(str(run)).config) for run in
-             fitting.training_folders(tmp_path / "run" / "framesamp_modul@2", 2)]  # fmt: skip
+    trained = sorted((tmp_path / "run").glob("training/*/*/trained.json"))
+    assert len(trained) == 8
+    seeds = [identity_of(MMEPolicy.from_pretrained(str(tmp_path / "run" / "training" / "framesamp_modul@2" / n)).config)
+             for n in "01"]  # fmt: skip
     assert [one and one.seed for one in seeds] == [0, 1] and seeds[0] != seeds[1]
-    command.run(resolved(compose("nano", words)))
-    assert len(made) == 8, "a finished run is not made again"
+    about = read_json(tmp_path / "run" / "further" / "framesamp_modul@2" / "1" / "trained.json", "a row")
+    assert (about["row"], about["seed"], about["budget"], about["decisions"]) == ("framesamp_modul@2", 1, 2, 6)
+    assert about["demonstrations"] == {"VideoUnmask": 2} and about["parameters"] > 1e6 and about["update_flops"] > 1e6
+    runs.run(resolved(compose("nano", words)))
+    assert len(made) == 2, "a finished run is not made again"
 
 
 def test_the_digest_of_demonstrations_does_not_depend_on_rendered_frames(tmp_path: Path) -> None:

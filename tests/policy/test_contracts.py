@@ -23,7 +23,7 @@ SIZES: dict[str, dict[str, Any]] = {
     "ttt": {"budget": 16, "max_steps": 8, "max_video": 4}, "rmt": {"budget": 16, "max_steps": 8, "max_video": 4},
     "retrieval": {"budget": 64, "every": 2, "longest": 3}, "moment": {"budget": 16, "moments": 2, "grid": 2},
     "gist": {"budget": 48, "anchors": 1, "recent": 1, "gists": 4, "stride": 8},
-    "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "learned_topk": {"budget": 32, "pool": 6},
+    "present": {"grid": 4}, "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "learned_topk": {"budget": 32, "pool": 6},
     "spacetime": {"stride": 4}, "bank": {"budget": 16, "grid": 4, "moments": 4, "video": 2, "hidden": 32, "length": 3},
     "anchors": {"spacing": 3}, "events": {"budget": 64, "stride": 4}, "pyramid": {"budget": 96, "strides": [1, 4]},
     "keyframes": {"budget": 64, "every": 4, "pool": 8},

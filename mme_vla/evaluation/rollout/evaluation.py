@@ -186,8 +186,10 @@ def _environments(
 ) -> VecEnv:
     robot = policy.embodiment
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
-    options["max_actions"] = policy.max_actions if isinstance(policy, LimitsActions) else None
+    limit = policy.max_actions if isinstance(policy, LimitsActions) else None
+    options["max_actions"] = settings.max_actions or limit
     if base is make_env:
+        options |= {"only_possible": True} if settings.only_possible else {}
         options |= {"sessions": _n_distractors(policy)}
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
         options |= {f"include_{name}": True for name in robot.readings}
@@ -220,7 +222,7 @@ def run_settings(
         "execute": settings.execute or policy.embodiment.action.execute,
         "flow_steps": settings.flow_steps or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
         **{name: getattr(settings, name) for name in names},
-        **({"event": settings.event} if settings.event else {}),
+        **{n: value for n in ("event", "max_actions", "only_possible") if (value := getattr(settings, n))},
     }
 
 

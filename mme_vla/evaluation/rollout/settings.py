@@ -18,6 +18,8 @@ class RolloutSettings:
 
     seed: of the policy's noise; it does not reach the environments.
     max_steps: actions until the outcome is `timeout`; by default as many as the split allows.
+    max_actions: actions, whatever frames they take, until the outcome is `timeout`; None: the policy's own limit.
+    only_possible: by choices, offer no option whose every object is out of reach.
     execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
     env: name of the environment in the registry.
     workers: environments at a time; None: one a core, at most 16.
@@ -34,6 +36,8 @@ class RolloutSettings:
     split: str = "test"
     env: str = "mme_vla"
     max_steps: PositiveInt = 0  # of the split
+    max_actions: PositiveInt | None = None
+    only_possible: bool = False
     execute: PositiveInt | None = None
     flow_steps: PositiveInt | None = None
     workers: PositiveInt | None = None

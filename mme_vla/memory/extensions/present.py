@@ -1,0 +1,30 @@
+"""Present: the current frame's tokens alone, as if they were memory.
+
+A control, not a memory: a policy with it has the parameters and the updates of one that remembers, and no past.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.registry import MEMORIES
+
+
+@MEMORIES.register("present")
+class Present(PerceptualMemory):
+    """grid² tokens of the current frame."""
+
+    lazy = True
+
+    def __init__(self, d_vision: int, width: int, grid: int = 4, pooling: str = "mean", **encoder: Any) -> None:
+        """See `PerceptualMemory`. grid, pooling: the current frame is grid×grid tokens."""
+        super().__init__(d_vision, width, grid**2, StorageSpec(grid, pooling), **encoder)
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return union_frames([np.asarray(steps, np.int64)])
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        return all_patches(np.array([step]), self.storage.grid)
