@@ -1,0 +1,316 @@
+"""The report card of a checkpoint: is its memory more than a clock, and how does it recover from a wrong one?"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mme_vla.envs.make import make_env
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.results.report import Section, html_page
+from mme_vla.evaluation.results.tables import Table, to_markdown
+from mme_vla.evaluation.rollout.evaluation import evaluate
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import find_records, read_folders, read_records
+from mme_vla.policy.base import Policy
+from mme_vla.probing import lines
+from mme_vla.probing.arms import lacking, read_arm, slug
+from mme_vla.probing.channels import channel_of
+from mme_vla.probing.lines import MomentLine
+from mme_vla.probing.report import Findings
+from mme_vla.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
+from mme_vla.subgoal import SubgoalPredictor
+from mme_vla.utils import to_json, write_atomically, write_json
+
+TIME, CONTENT, WRONG_SCENE = "time-shifted", "content-swapped", "wrong scene first"
+ARMS = {
+    TIME: "delay:64", "order-broken": "shuffle", CONTENT: "swap", WRONG_SCENE: "distract:1",
+    "nothing remembered": "drop:all", "oracle frames": "oracle",
+}  # fmt: skip
+"""What a card measures in closed loop beside the matched run, and the interventions that do it."""
+MATCHED, AGAIN = "unprobed", "again"
+PAGE, FIGURES = "card.html", "card.json"
+_SAMPLES, _TAILS = 10_000, (0.025, 0.975)
+_HOW = (
+    "Every arm runs the scenes of the matched run with its noise. A loss is the matched success minus the arm's, with "
+    "a 95 % interval (paired bootstrap over scenes). It is beyond noise if the interval lies above 0 and the loss "
+    "exceeds the share of scenes that end otherwise when the matched run is repeated with other noise.",
+    "The memory-or-clock score is the loss under time shift / (that loss + the loss under content swap): 1 where a "
+    "policy reads only time, 0 where it reads only content. It is undefined where both losses lie within noise.",
+    "Recovery counts, on recorded episodes before which another scene is seen, the decisions until the chunk never "
+    "again changes by more than the policy's own spread.",
+)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What an arm costs. success: share of the scenes that it solves, 0 to 1. loss: the matched share minus it.
+
+    low, high: 95 % interval of the loss. lost, gained: scenes that only the matched run solves, or only the arm.
+    """
+
+    success: float
+    loss: float
+    low: float
+    high: float
+    lost: int
+    gained: int
+    beyond_noise: bool
+
+
+@dataclass(frozen=True)
+class ClockScore:
+    """The memory-or-clock score, 0 to 1, and its 95 % interval; None, with the reason, where it is undefined."""
+
+    score: float | None = None
+    low: float | None = None
+    high: float | None = None
+    undefined: str | None = None
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Decisions until a policy that saw another scene first acts as without it, on recorded episodes.
+
+    A recording has recovered at the first decision from which on the chunk never changes by more than the policy's own
+    spread. median: over the recordings; None where at least half of them do not recover. recovered: those that do.
+    decisions: mean number of decisions of a recording.
+    """
+
+    median: float | None
+    recovered: int
+    recordings: int
+    decisions: float
+
+
+@dataclass(frozen=True)
+class Card:
+    """Everything a card shows. noise: share of scenes that end otherwise in an equal run with other noise.
+
+    writing: score of writing (`mme_vla.probing.writing`). references: success of other runs on the same scenes.
+    """
+
+    model: str
+    checkpoint: int | str
+    scenes: int
+    matched: float
+    noise: float
+    arms: dict[str, Loss]
+    memory_or_clock: ClockScore
+    recovery: Recovery | None = None
+    writing: dict[str, Any] | None = None
+    references: dict[str, float] | None = None
+    notes: Sequence[str] = ()
+
+
+Outcomes = Mapping[EpisodeKey, float]
+"""Success of each scene."""
+
+
+def run_card(
+    policy: Policy,
+    plan: ProbePlan,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    references: Mapping[str, str] | None = None,
+    subgoals: SubgoalPredictor | None = None,
+    base: Callable[..., Any] = make_env,
+    show_progress: bool = True,
+) -> Card:
+    """Run what the folder lacks of a card, and write `card.html` and `card.json`.
+
+    Args:
+        plan: its jobs are the scenes, its recordings those that recovery is measured on, `lend` those to take contents
+            from. references: name → folder of records, floors and ceilings such as `{"demonstrator": "outputs/…"}`.
+    """
+    channel, in_simulation = channel_of(policy), base is make_env and settings.env == "mme_vla"
+    arms = {label: read_arm(word) for label, word in ARMS.items()}
+    reasons = {label: lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
+               for label, arm in arms.items()}  # fmt: skip
+    notes = [f"{label} ({ARMS[label]}) was left out: it needs {why}." for label, why in reasons.items() if why]
+    possible = [label for label, why in reasons.items() if why is None]
+    options: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
+    words = [ARMS[label] for label in possible]
+    run_probe(policy, replace(plan, arms=words, recordings=()), folder, facts, settings, **options)
+    again = replace(settings, seed=settings.seed + 1)
+    renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
+    repeated = evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, source=plan.source, **options).records
+    outcomes = {label: _outcomes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    recovered = None
+    if plan.recordings and len(plan.lend) > 1:
+        offline = replace(plan.offline, moments=None, scan=False)
+        wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
+        run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
+        recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
+    card = grade(_outcomes(folder / ONLINE / MATCHED, plan), outcomes, outcomes_of(repeated))
+    card = replace(
+        card, model=facts.model, checkpoint=facts.checkpoint, recovery=recovered,
+        references={name: _reference(place, plan) for name, place in (references or {}).items()},
+        writing=_writing(policy, plan) if in_simulation and channel.chooses else None,
+        notes=[*notes, *card.notes],
+    )  # fmt: skip
+    write_card(card, folder)
+    return card
+
+
+def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> Card:
+    """A card from outcomes in closed loop.
+
+    Args:
+        matched: of the run without an intervention. arms: label → outcomes on the same scenes. again: of an equal run
+            with other noise.
+    """
+    keys = [key for key in matched if key in again and all(key in outcomes for outcomes in arms.values())]
+    noise = _mean({key: abs(matched[key] - again[key]) for key in keys})
+    table = {label: {key: matched[key] - outcomes[key] for key in keys} for label, outcomes in arms.items()}
+    sampled = dict(zip(table, _bootstrap(list(table.values())), strict=True))
+    losses = {}
+    for label, differences in table.items():
+        loss, (low, high) = _mean(differences), np.quantile(sampled[label], _TAILS)
+        signs = np.sign(list(differences.values()))
+        losses[label] = Loss(
+            _mean({key: arms[label][key] for key in keys}), loss, float(low), float(high), int((signs > 0).sum()),
+            int((signs < 0).sum()), bool(low > 0 and loss > noise),
+        )  # fmt: skip
+    score = clock_score(losses, sampled)
+    return Card("", "", len(keys), _mean({key: matched[key] for key in keys}), noise, losses, score)
+
+
+def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -> ClockScore:
+    """The memory-or-clock score. sampled: the losses of each arm on the same scenes drawn anew, [samples]."""
+    if missing := [label for label in (TIME, CONTENT) if label not in losses]:
+        return ClockScore(undefined=f"{' and '.join(missing)} could not be measured")
+    if not any(losses[label].beyond_noise for label in (TIME, CONTENT)):
+        return ClockScore(undefined="neither loss is beyond noise")
+
+    def share(time: Any, content: Any) -> Any:
+        time, content = np.maximum(time, 0.0), np.maximum(content, 0.0)
+        known = time + content > 0
+        return time[known] / (time + content)[known]
+
+    low, high = np.quantile(share(sampled[TIME], sampled[CONTENT]), _TAILS)
+    score = share(np.array([losses[TIME].loss]), np.array([losses[CONTENT].loss]))
+    return ClockScore(float(score[0]), float(low), float(high))
+
+
+def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
+    """How long the wrong scene has an effect. moments: of one arm, at every decision of each recording."""
+    after: list[float] = []
+    counts = []
+    for name in dict.fromkeys(line.recording for line in moments):
+        mine = sorted((line for line in moments if line.recording == name), key=lambda line: line.step)
+        misled = [i for i, line in enumerate(mine) if line.change > line.spread]
+        first = misled[-1] + 1 if misled else 0
+        after.append(first if first < len(mine) else float("inf"))
+        counts.append(len(mine))
+    if not after:
+        return None
+    median = float(np.median(after))
+    return Recovery(median if np.isfinite(median) else None, int(np.isfinite(after).sum()), len(after),
+                    float(np.mean(counts)))  # fmt: skip
+
+
+def outcomes_of(records: Sequence[EpisodeRecord]) -> dict[EpisodeKey, float]:
+    """Success of each scene, averaged where it was run several times."""
+    runs: dict[EpisodeKey, list[float]] = {}
+    for record in records:
+        runs.setdefault(record.key, []).append(float(record.success))
+    return {key: float(np.mean(values)) for key, values in runs.items()}
+
+
+def _outcomes(folder: Path, plan: ProbePlan) -> dict[EpisodeKey, float]:
+    scenes = {(job.task, job.episode) for job in plan.jobs}
+    records = [record for path in sorted(folder.glob("episodes*.jsonl")) for record in read_records(path)]
+    return outcomes_of([record for record in records if record.key in scenes and record.outcome != "error"])
+
+
+def _reference(place: str, plan: ProbePlan) -> float:
+    """Success of another run on the scenes of the card; NaN where it has none of them."""
+    scenes = {(job.task, job.split, job.episode) for job in plan.jobs}
+    records = read_folders(find_records([Path(place).expanduser()]))
+    return _mean(outcomes_of([r for r in records if (r.task, r.split, r.episode) in scenes]))
+
+
+def _mean(values: Outcomes) -> float:
+    """Mean over tasks of the means over their scenes; NaN without scenes."""
+    tasks = dict.fromkeys(key.task for key in values)
+    means = [np.mean([value for key, value in values.items() if key.task == task]) for task in tasks]
+    return float(np.mean(means)) if means else float("nan")
+
+
+def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
+    """Means over tasks of scenes drawn anew within each task, the same ones for all columns: [columns, samples]."""
+    rng, keys = np.random.default_rng(0), list(columns[0]) if columns else []
+    tasks = dict.fromkeys(key.task for key in keys)
+    means = np.zeros((len(columns), _SAMPLES))
+    for task in tasks:
+        values = np.array([[column[key] for key in keys if key.task == task] for column in columns])
+        means += values[:, rng.integers(0, values.shape[1], (_SAMPLES, values.shape[1]))].mean(-1)
+    return means / max(len(tasks), 1)
+
+
+def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any]:
+    """The score of writing on the scenes of the card."""
+    from mme_vla.envs.base import environment
+    from mme_vla.policy.capabilities import with_vision_memory
+    from mme_vla.probing.evidence import record_evidence
+    from mme_vla.probing.writing import frames_rendered, writing_of
+
+    memory, env = with_vision_memory(policy).require_memory(), environment("mme_vla")
+    specs = [env.episode(job.task, job.split, job.episode) for job in plan.jobs]
+    scores: dict[str, Any] = writing_of(memory, record_evidence(specs, frames_rendered(memory)), policy).to_dict()
+    return scores
+
+
+def tables_of(card: Card) -> list[Table]:
+    """The card as tables."""
+    score, after = card.memory_or_clock, card.recovery
+    if score.score is None:
+        clock = f"undefined: {score.undefined}"
+    else:
+        clock = f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]"
+    rows = [
+        ["memory-or-clock score", clock],
+        ["noise: scenes that end otherwise in an equal run", _percent(card.noise)],
+    ]
+    if after is not None:
+        median = "no" if after.median is None else f"{after.median:g} decisions"
+        text = f"{median} (median); {after.recovered} of {after.recordings} within {after.decisions:.0f} decisions"
+        rows.append(["recovery after another scene", text])
+    if card.writing is not None:
+        mean = card.writing["mean"]
+        rows.append(["score of writing", f"{mean['score']:.2f} (chance {mean['chance']:.2f})"])
+    arms = [["matched", "", _percent(card.matched), "", "", "", ""]]
+    for label, loss in card.arms.items():
+        arms.append([
+            label, ARMS[label], _percent(loss.success), _percent(loss.loss),
+            f"[{100 * loss.low:.0f}, {100 * loss.high:.0f}]", f"{loss.lost} : {loss.gained}",
+            "yes" if loss.beyond_noise else "no",
+        ])  # fmt: skip
+    arms += [[name, "", _percent(rate), "", "", "", ""] for name, rate in (card.references or {}).items()]
+    columns = ("history", "intervention", "success", "loss", "95 %", "lost : gained", "beyond noise")
+    return [Table("In short", ("", ""), rows), Table("Histories in closed loop", columns, arms)]
+
+
+def write_card(card: Card, folder: Path) -> None:
+    """Write the page and the JSON."""
+    write_json(folder / FIGURES, to_json(asdict(card)))
+    sections = [Section(table.title, tables=[table]) for table in tables_of(card)]
+    sections.append(Section("How the numbers are made", paragraphs=_HOW))
+    title, subtitle = f"Report card of {card.model}", f"checkpoint {card.checkpoint}, {card.scenes} scenes"
+    with write_atomically(folder / PAGE) as draft:
+        draft.write_text(html_page(title, sections, subtitle, card.notes), encoding="utf-8")
+
+
+def card_text(card: Card) -> str:
+    """The card in Markdown."""
+    return "\n".join([*map(to_markdown, tables_of(card)), *card.notes])
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
