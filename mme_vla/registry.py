@@ -165,11 +165,14 @@ HISTORY_TRANSFORMS: Registry[Any] = Registry(
     "history transform",
     dict.fromkeys(("repeat_frame", "speed", "drop_frames", "noise"), "mme_vla.memory.transforms"),
 )
+EVENTS: Registry[Any] = Registry(
+    "event", dict.fromkeys(("pause", "gap", "speed", "restart"), "mme_vla.evaluation.rollout.events")
+)
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "env": ENVS, "player": PLAYERS,
     "intervention": INTERVENTIONS, "reward": REWARDS,
-    "history_transform": HISTORY_TRANSFORMS, "prompt": PROMPTS,
+    "history_transform": HISTORY_TRANSFORMS, "prompt": PROMPTS, "event": EVENTS,
 }  # fmt: skip
 
 
@@ -179,7 +182,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
             `subgoal` (a predictor), `task`, `env`, `player`, `intervention` (of a probe), `reward`,
-            `history_transform` or `prompt` (a prompt format).
+            `history_transform`, `prompt` (a prompt format) or `event` (of a rollout).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import os
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,13 +58,15 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
         choose_episodes,
         choose_shard,
         default_output,
-        evaluate,
+        evaluate_events,
         facts_of,
     )
+    from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
 
     values = resolved(cfg)
-    settings = RolloutSettings.from_config(values)
+    events = event_arms(values["event"])
+    settings = RolloutSettings.from_config({**values, "event": None})
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
         repeat_exactly()
@@ -89,8 +92,8 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
     _use_spawn()
     try:
-        done = evaluate(
-            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings,
+        done = evaluate_events(
+            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings, events,
             subgoals=subgoals, shard=shard, source=source, notes=notes,
             times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
         )  # fmt: skip
@@ -168,7 +171,9 @@ def report(done: "Evaluation", output: Path) -> None:
         table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %", *cells)
     # Piped into a file there is no terminal to fit: as wide as the table is.
     console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
-    if rows:
+    if done.matched:
+        report_events(done, console.width)
+    elif rows:
         console.print(table)
     work = done.workload
     if work.batches:
@@ -179,6 +184,16 @@ def report(done: "Evaluation", output: Path) -> None:
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
     logger.info("python -m mme_vla.results %s", output)
+
+
+def report_events(done: "Evaluation", width: int) -> None:
+    """Say what events changed, and where one did not act."""
+    from mme_vla.evaluation.results.events import did_not_act, event_table
+    from mme_vla.evaluation.results.tables import print_table
+
+    print_table(event_table([*done.records, *done.matched], "first"), width)
+    for event, count in Counter(event for record in done.records for event in did_not_act(record)).items():
+        logger.warning("event=%s did not act in %d episodes: its place never came", event, count)
 
 
 def report_usage(usage: "Usage") -> None:

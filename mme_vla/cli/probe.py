@@ -35,6 +35,7 @@ def probe(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
     from mme_vla.envs.base import environment
     from mme_vla.evaluation.rollout.evaluation import choose_shard, facts_of
+    from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.card import PAGE, card_text, run_card
     from mme_vla.probing.offline import OfflineSettings
@@ -50,7 +51,8 @@ def probe(cfg: DictConfig) -> None:
         raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
     if values["offline"] and values["recordings"] is None and not card:
         raise UserError(NO_DATA)
-    settings = RolloutSettings.from_config(values)
+    events = event_arms(values["event"])
+    settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
     jobs = _jobs(values, settings) if values["online"] or card else []
     shard = choose_shard(values["shard"])
@@ -67,7 +69,7 @@ def probe(cfg: DictConfig) -> None:
     folder = Path("outputs", "card" if card else "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events, shard, source)
     try:
         if card:
             graded = run_card(

@@ -234,7 +234,8 @@ class _Collector(Rollout):
         decisions = self._decisions.setdefault(running, [])
         if reply.reward is not None and decisions:
             decisions[-1].reward += float(reply.reward)
-            decisions[-1].actions = decisions[-1].actions[: int(reply.info.get("executed", 0))]
+            if running.events.holding is None:
+                decisions[-1].actions = decisions[-1].actions[: int(reply.info.get("executed", 0))]
         super()._take(reply)
 
     @torch.no_grad()

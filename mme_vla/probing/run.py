@@ -19,7 +19,8 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, facts_of
+from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, evaluate_events, facts_of
+from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import claim_run, find_records, fingerprint, read_folders
@@ -45,7 +46,8 @@ class ProbePlan:
     """What is probed.
 
     arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
-    jobs: episodes of the closed loop, none for none. source: where the weights are from.
+    jobs: episodes of the closed loop, none for none. events: further arms of it, in the simulation.
+    source: where the weights are from.
     """
 
     arms: Any = None
@@ -53,6 +55,7 @@ class ProbePlan:
     lend: Sequence[Recording] = ()
     jobs: Sequence[Job] = ()
     offline: OfflineSettings = field(default_factory=OfflineSettings)
+    events: Sequence[str] = ()
     shard: Shard = field(default_factory=Shard)
     source: str | None = None
 
@@ -98,6 +101,10 @@ def run_probe(
                 settings, subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
                 notes={"arm": arm.name}, show_progress=show_progress,
             )  # fmt: skip
+        if plan.events:
+            evaluate_events(policy, plan.jobs, folder / ONLINE / slug(UNPROBED.name), facts, settings, plan.events,
+                            subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
+                            notes={"arm": UNPROBED.name}, show_progress=show_progress)  # fmt: skip
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
     comparisons = _paired(records, facts.split, facts.model)
@@ -154,6 +161,7 @@ def probe(
     name: str | None = None,
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
+    event: str | Sequence[str] | None = None,
     **settings: Any,
 ) -> Probe:
     """Measure what a policy takes from its memory; what `output` holds already is not run again.
@@ -168,7 +176,8 @@ def probe(
         draws: chunks sampled at each step. moments: most steps of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
-        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
+        show_progress: whether a progress bar is shown. event: further arms of the closed loop, as for `evaluate`.
+        settings: of `RolloutSettings`, such as `workers=2`.
 
     Returns:
         Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
@@ -186,7 +195,7 @@ def probe(
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
-    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source)
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, event_arms(event), source=source)
     folder = Path(output).expanduser()
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress
@@ -208,7 +217,7 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
     methods = aggregate(records, protocol, split).methods
-    baseline = next((method for method in methods if method.model == model), None)
+    baseline = next((method for method in methods if method.model == model and method.event is None), None)
     if baseline is None:
         return []
     return compare_all([(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)], protocol)
