@@ -95,7 +95,19 @@ MEMORIES: Registry[Any] = Registry(
         **{name: f"mme_vla.memory.{name}" for name in ("framesamp", "tokendrop", "ttt", "rmt", "joined")},
         **{
             name: f"mme_vla.memory.extensions.{name}"
-            for name in ("actions", "bank", "gist", "learned_topk", "moment", "retrieval", "spacetime")
+            for name in (
+                "actions",
+                "anchors",
+                "bank",
+                "events",
+                "gist",
+                "keyframes",
+                "learned_topk",
+                "moment",
+                "pyramid",
+                "retrieval",
+                "spacetime",
+            )
         },
     },
 )

@@ -167,12 +167,15 @@ def draw_memory(
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
     from mme_vla.data.memory_image import memory_sheet
+    from mme_vla.data.statistics import normalised_states
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
     history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
     stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
     history.append(frames, _no_tokens(len(stored), patches))
+    motion = normalised_states(source.states(episode, 0, step + 1))
+    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
     selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")

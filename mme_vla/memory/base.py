@@ -221,7 +221,7 @@ class ScoringMemory:
 
 
 class ProprioMemory:
-    """Capability of a memory: it reads proprioception and motion (`History.motion`) instead of stored tokens."""
+    """Capability of a memory: it reads proprioception and motion (`History.motion`), with stored tokens or without."""
 
     uses_proprio: bool = True
 

@@ -302,7 +302,7 @@ def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
             nothing,
             np.zeros(demonstration.length, bool),
         )
-        history.motion = motion.__getitem__
+        history.motion, history.state_width = motion.__getitem__, policy.embodiment.state.width
     return history
 
 

@@ -53,7 +53,9 @@ class Appear:
 
 
 class Cover:
-    """Containers are away for half of a window and then stand over what lay open."""
+    """Containers are away for half of a window and then stand over what lay open. active: they are away."""
+
+    active = False
 
     def __init__(self, containers: Sequence[Thing], group: int | None = None) -> None:
         """`group`: park each container at a place of its own (`parked`); None: all at one."""
@@ -64,12 +66,13 @@ class Cover:
 
     def apply(self, k: int) -> None:
         """Move the containers for the step before which `k` steps were done."""
+        self.active = k < UNCOVERED_STEPS
         for part in self._parts:
             part.apply(k)
 
 
 class Swap:
-    """Two objects change places on arcs around each other while all others stand still.
+    """Two objects change places on arcs around each other while all others stand still. active: they move.
 
     Args:
         initiator: one of the two; the other is `partner`, by default the nearest one when the swap begins.
@@ -78,6 +81,8 @@ class Swap:
         lane: how far the two evade each other sideways, metres.
         steps: how long it takes.
     """
+
+    active = False
 
     def __init__(
         self,
@@ -99,7 +104,8 @@ class Swap:
 
     def apply(self, k: int) -> None:
         """Move the objects for the step before which `k` steps were done."""
-        if not self.start <= k <= self.end:
+        self.active = self.start <= k <= self.end
+        if not self.active:
             return
         if k == self.start:
             self._begin()
@@ -145,6 +151,11 @@ def planned_swaps(
     return [Swap(group[a], group, start + i * steps, partner=group[b], steps=steps) for i, (a, b) in enumerate(pairs)]
 
 
+def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> set[str]:
+    """Names of the motions that take place, by their kind and number: `swap 0`."""
+    return {f"{type(motion).__name__.lower()} {i}" for i, motion in enumerate(motions) if motion.active}
+
+
 class Hide:
     """Hidden objects are away during a window; at its end each lies under its container again."""
 
@@ -164,8 +175,9 @@ class Hide:
 
 
 class Highlight:
-    """A white disc under an object from one step to another, both included."""
+    """A white disc under an object from one step to another, both included. active: it is visible."""
 
+    active = False
     DEPTH = 0.01
     """How far below the object's origin the disc lies, metres."""
 
@@ -174,7 +186,8 @@ class Highlight:
 
     def apply(self, k: int) -> None:
         """Move the disc for the step before which `k` steps were done."""
-        if self._start <= k <= self._end:
+        self.active = self._start <= k <= self._end
+        if self.active:
             below = self._thing.position - [0, 0, self.DEPTH]
             self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         else:
