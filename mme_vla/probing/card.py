@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
+from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, to_markdown
@@ -16,12 +18,15 @@ from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders, read_records
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.probing import lines
 from mme_vla.probing.arms import lacking, read_arm, slug
 from mme_vla.probing.channels import channel_of
+from mme_vla.probing.evidence import record_evidence
 from mme_vla.probing.lines import MomentLine
 from mme_vla.probing.report import Findings
 from mme_vla.probing.run import OFFLINE, ONLINE, ProbePlan, run_probe
+from mme_vla.probing.writing import required_frames, score_writing
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.utils import to_json, write_atomically, write_json
 
@@ -135,8 +140,8 @@ def run_card(
     notes = [f"{label} ({ARMS[label]}) was left out: it needs {why}." for label, why in reasons.items() if why]
     possible = [label for label, why in reasons.items() if why is None]
     options: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
-    words = [ARMS[label] for label in possible]
-    run_probe(policy, replace(plan, arms=words, recordings=()), folder, facts, settings, **options)
+    plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
+    run_probe(policy, replace(plan, recordings=()), folder, facts, settings, **options)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
     repeated = evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, source=plan.source, **options).records
@@ -147,12 +152,14 @@ def run_card(
         wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
         recovered = recovery(Findings.of(lines.read_all(folder / OFFLINE)).moments)
+    writing = _writing(policy, plan) if in_simulation and channel.chooses else None
+    if isinstance(writing, str):
+        notes.append(writing)
     card = grade(_outcomes(folder / ONLINE / MATCHED, plan), outcomes, outcomes_of(repeated))
     card = replace(
         card, model=facts.model, checkpoint=facts.checkpoint, recovery=recovered,
         references={name: _reference(place, plan) for name, place in (references or {}).items()},
-        writing=_writing(policy, plan) if in_simulation and channel.chooses else None,
-        notes=[*notes, *card.notes],
+        writing=writing if isinstance(writing, dict) else None, notes=notes,
     )  # fmt: skip
     write_card(card, folder)
     return card
@@ -254,17 +261,17 @@ def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
     return means / max(len(tasks), 1)
 
 
-def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any]:
-    """The score of writing on the scenes of the card."""
-    from mme_vla.envs.base import environment
-    from mme_vla.policy.capabilities import with_vision_memory
-    from mme_vla.probing.evidence import record_evidence
-    from mme_vla.probing.writing import frames_rendered, writing_of
-
+def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
+    """The score of writing on demonstrations of the card's scenes, or why there is none."""
     memory, env = with_vision_memory(policy).require_memory(), environment("mme_vla")
-    specs = [env.episode(job.task, job.split, job.episode) for job in plan.jobs]
-    scores: dict[str, Any] = writing_of(memory, record_evidence(specs, frames_rendered(memory)), policy).to_dict()
-    return scores
+    try:
+        frames = required_frames(memory)
+        specs = (env.episode(job.task, job.split, job.episode) for job in plan.jobs)
+        episodes = [episode for spec in specs if (episode := record_evidence(spec, frames)) is not None]
+        scores: dict[str, Any] = score_writing(memory, episodes, policy).to_dict()  # type: ignore[arg-type]
+    except UserError as error:
+        return f"No score of writing: {error}"
+    return scores if scores["tasks"] else "No score of writing: no scene has a fact that a frame shows."
 
 
 def tables_of(card: Card) -> list[Table]:

@@ -1,6 +1,7 @@
 """The report card tells a policy that reads time from one that reads content."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from mme_vla.evaluation.receipts import verify
 from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing.arms import read_arm
 from mme_vla.probing.card import (
@@ -86,6 +88,11 @@ class Reader(MMEPolicy):
 
     reads: str = TIME
     prototypes: Tensor
+
+    def predict_chunk(self, batch: Any, episodes: Any, draws: Any, steps: Any = None) -> Tensor:
+        histories = [episode.required_history() for episode in episodes]
+        tokens = [self.require_memory().gather_selection(history, len(history) - 1) for history in histories]
+        return self.sample_actions(replace(batch, history=stack_history(tokens, self.device)), draws, steps)
 
     def sample_actions(self, batch: Any, draws: Any = None, steps: Any = None, **others: Any) -> Tensor:
         times = batch.history.positions[..., 0]
