@@ -52,13 +52,10 @@ VERIFY_EXAMPLES = ("outputs/evaluation/framesamp_modul/80000/seed42", "receipt.j
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write; or check receipts."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words[:1] == ["verify"]:
-        with print_user_errors():
-            verify(_verify_parser().parse_args(words[1:]))
-        return
-    args = _parser().parse_intermixed_args(words)
+    checks = words[:1] == ["verify"]
+    args = _verify_parser().parse_args(words[1:]) if checks else _parser().parse_intermixed_args(words)
     with print_user_errors():
-        run(args)
+        (verify if checks else run)(args)
 
 
 def verify(args: argparse.Namespace) -> None:
@@ -67,13 +64,11 @@ def verify(args: argparse.Namespace) -> None:
 
     paths = [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
     require(paths, f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or below.")
-    different = False
-    for path in paths:
-        differences, notes = receipts.verify(path, args.checkpoint)
-        different |= bool(differences)
+    results = {path: receipts.verify(path, args.checkpoint) for path in paths}
+    for path, (differences, notes) in results.items():
         print(f"{path}: {'differs' if differences else 'agrees'}")
-        print("".join(f"  {line}\n" for line in [*differences, *(f"note: {note}" for note in notes)]), end="")
-    if different:
+        print("".join(f"  {printable(line)}\n" for line in [*differences, *(f"note: {n}" for n in notes)]), end="")
+    if any(differences for differences, _ in results.values()):
         raise SystemExit(1)
 
 

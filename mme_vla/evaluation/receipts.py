@@ -156,11 +156,10 @@ def _conditions(on_gpu: bool, renders: bool) -> dict[str, Any]:
 def _checkpoint(policy: Policy, source: str | None) -> dict[str, Any]:
     """Digests of the files that the weights are from, and of the statistics in use."""
     folder = None if source is None or not Path(source).is_dir() else Path(source).resolve()
-    files: dict[str, str | None] = {}
+    files: Mapping[str, str | None] = {}
     if folder is not None:
-        table = Sums(folder).table  # compared with the files when they were loaded
-        names = table or [path.name for path in folder.iterdir() if path.suffix in (".json", ".safetensors", ".model")]
-        files = table or _sums(folder, names)
+        # Those of the table were compared with the files when they were loaded.
+        files = Sums(folder).table or _sums(folder, [path.name for path in folder.iterdir() if path.is_file()])
     statistics = digest(policy.require_processor().require_stats().to_dict(), 64)
     kept = {name: value for name, value in sorted(files.items()) if not name.startswith(_OF_TRAINING)}
     return {

@@ -1,6 +1,6 @@
 """The report card of a checkpoint: is its memory more than a clock, and how does it recover from a wrong one?"""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,18 +9,18 @@ import numpy as np
 
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import find_records, read_folders, read_records
+from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.probing import lines
-from mme_vla.probing.arms import lacking, read_arm, slug
+from mme_vla.probing.arms import UNPROBED, lacking, read_arm, slug
 from mme_vla.probing.channels import channel_of
 from mme_vla.probing.evidence import record_evidence
 from mme_vla.probing.lines import MomentLine
@@ -36,8 +36,7 @@ ARMS = {
     "nothing remembered": "drop:all", "oracle frames": "oracle",
 }  # fmt: skip
 """What a card measures in closed loop beside the matched run, and the interventions that do it."""
-MATCHED, AGAIN = "unprobed", "again"
-PAGE, FIGURES = "card.html", "card.json"
+AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
 _SAMPLES, _TAILS = 10_000, (0.025, 0.975)
 _HOW = (
     "Every arm runs the scenes of the matched run with its noise. A loss is the matched success minus the arm's, with "
@@ -138,14 +137,14 @@ def run_card(
     reasons = {label: lacking(arm, policy, channel, len(plan.lend), boundaries=in_simulation)
                for label, arm in arms.items()}  # fmt: skip
     notes = [f"{label} ({ARMS[label]}) was left out: it needs {why}." for label, why in reasons.items() if why]
+    others = {name: _reference(name, place, plan) for name, place in (references or {}).items()}
     possible = [label for label, why in reasons.items() if why is None]
-    options: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
+    how: dict[str, Any] = {"subgoals": subgoals, "base": base, "show_progress": show_progress}
     plan = replace(plan, arms=[ARMS[label] for label in possible], events=())
-    run_probe(policy, replace(plan, recordings=()), folder, facts, settings, **options)
+    run_probe(policy, replace(plan, recordings=()), folder, facts, settings, **how)
     again = replace(settings, seed=settings.seed + 1)
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
-    repeated = evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, source=plan.source, **options).records
-    outcomes = {label: _outcomes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, shard=plan.shard, source=plan.source, **how)
     recovered = None
     if plan.recordings and len(plan.lend) > 1:
         offline = replace(plan.offline, moments=None, scan=False)
@@ -155,11 +154,11 @@ def run_card(
     writing = _writing(policy, plan) if in_simulation and channel.chooses else None
     if isinstance(writing, str):
         notes.append(writing)
-    card = grade(_outcomes(folder / ONLINE / MATCHED, plan), outcomes, outcomes_of(repeated))
+    matched, repeated = _outcomes(folder / ONLINE / slug(UNPROBED.name), plan), _outcomes(folder / AGAIN, plan)
+    card = grade(matched, {x: _outcomes(folder / ONLINE / slug(arms[x].name), plan) for x in possible}, repeated)
     card = replace(
-        card, model=facts.model, checkpoint=facts.checkpoint, recovery=recovered,
-        references={name: _reference(place, plan) for name, place in (references or {}).items()},
-        writing=writing if isinstance(writing, dict) else None, notes=notes,
+        card, model=facts.model, checkpoint=facts.checkpoint, recovery=recovered, references=others, notes=notes,
+        writing=writing if isinstance(writing, dict) else None,
     )  # fmt: skip
     write_card(card, folder)
     return card
@@ -207,40 +206,41 @@ def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -
 
 def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
     """How long the wrong scene has an effect. moments: of one arm, at every decision of each recording."""
-    after: list[float] = []
-    counts = []
-    for name in dict.fromkeys(line.recording for line in moments):
-        mine = sorted((line for line in moments if line.recording == name), key=lambda line: line.step)
-        misled = [i for i, line in enumerate(mine) if line.change > line.spread]
-        first = misled[-1] + 1 if misled else 0
-        after.append(first if first < len(mine) else float("inf"))
-        counts.append(len(mine))
-    if not after:
+    misled: dict[str, list[bool]] = {}
+    for line in sorted(moments, key=lambda line: line.step):
+        misled.setdefault(line.recording, []).append(line.change > line.spread)
+    if not misled:
         return None
+    last = [max(np.flatnonzero(flags), default=-1) for flags in misled.values()]
+    lengths = [len(flags) for flags in misled.values()]
+    after = [i + 1 if i + 1 < n else np.inf for i, n in zip(last, lengths, strict=True)]
     median = float(np.median(after))
-    return Recovery(median if np.isfinite(median) else None, int(np.isfinite(after).sum()), len(after),
-                    float(np.mean(counts)))  # fmt: skip
+    return Recovery(
+        median if np.isfinite(median) else None, int(np.isfinite(after).sum()), len(after), float(np.mean(lengths))
+    )
 
 
-def outcomes_of(records: Sequence[EpisodeRecord]) -> dict[EpisodeKey, float]:
-    """Success of each scene, averaged where it was run several times."""
+def outcomes_of(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, float]:
+    """Success of each scene, averaged where it was run several times; scenes that ended in an error are left out."""
     runs: dict[EpisodeKey, list[float]] = {}
     for record in records:
-        runs.setdefault(record.key, []).append(float(record.success))
+        if record.outcome != "error":
+            runs.setdefault(record.key, []).append(float(record.success))
     return {key: float(np.mean(values)) for key, values in runs.items()}
 
 
 def _outcomes(folder: Path, plan: ProbePlan) -> dict[EpisodeKey, float]:
-    scenes = {(job.task, job.episode) for job in plan.jobs}
-    records = [record for path in sorted(folder.glob("episodes*.jsonl")) for record in read_records(path)]
-    return outcomes_of([record for record in records if record.key in scenes and record.outcome != "error"])
-
-
-def _reference(place: str, plan: ProbePlan) -> float:
-    """Success of another run on the scenes of the card; NaN where it has none of them."""
+    """Success of the card's scenes in a folder of records."""
     scenes = {(job.task, job.split, job.episode) for job in plan.jobs}
-    records = read_folders(find_records([Path(place).expanduser()]))
-    return _mean(outcomes_of([r for r in records if (r.task, r.split, r.episode) in scenes]))
+    records = read_folders(path for path in find_records([folder]) if path.parent == folder)
+    return outcomes_of(record for record in records if (record.task, record.split, record.episode) in scenes)
+
+
+def _reference(name: str, place: str, plan: ProbePlan) -> float:
+    """Mean success of another run on the scenes of the card."""
+    outcomes = _outcomes(Path(place).expanduser(), plan)
+    require(outcomes, f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same ones.")
+    return _mean(outcomes)
 
 
 def _mean(values: Outcomes) -> float:
@@ -277,14 +277,9 @@ def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
 def tables_of(card: Card) -> list[Table]:
     """The card as tables."""
     score, after = card.memory_or_clock, card.recovery
-    if score.score is None:
-        clock = f"undefined: {score.undefined}"
-    else:
-        clock = f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]"
-    rows = [
-        ["memory-or-clock score", clock],
-        ["noise: scenes that end otherwise in an equal run", _percent(card.noise)],
-    ]
+    defined = f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]" if score.undefined is None else ""
+    rows = [["memory-or-clock score", defined or f"undefined: {score.undefined}"]]
+    rows.append(["noise: scenes that end otherwise in an equal run", _percent(card.noise)])
     if after is not None:
         median = "no" if after.median is None else f"{after.median:g} decisions"
         text = f"{median} (median); {after.recovered} of {after.recordings} within {after.decisions:.0f} decisions"
