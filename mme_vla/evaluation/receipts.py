@@ -128,7 +128,7 @@ def _scenes(records: Iterable[EpisodeRecord], split: str) -> str:
 
 def _other_scenes(records: Iterable[EpisodeRecord], settings: Mapping[str, Any]) -> list[str]:
     """Episodes whose seed or difficulty is not the one that the environment gives them here."""
-    env, lines = environment(settings["env"]), []
+    env, lines = environment(settings["env"]), list[str]()
     for record in records:
         spec = env.episode(record.task, record.split, record.episode)
         here = f"{spec.seed}, {spec.difficulty}"

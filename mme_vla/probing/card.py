@@ -19,6 +19,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import with_vision_memory
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import UNPROBED, lacking, read_arm, slug
 from mme_vla.probing.channels import channel_of
@@ -268,7 +269,8 @@ def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
         frames = required_frames(memory)
         specs = (env.episode(job.task, job.split, job.episode) for job in plan.jobs)
         episodes = [episode for spec in specs if (episode := record_evidence(spec, frames)) is not None]
-        scores: dict[str, Any] = score_writing(memory, episodes, policy).to_dict()  # type: ignore[arg-type]
+        encoder = policy if isinstance(policy, MMEPolicy) else None
+        scores: dict[str, Any] = score_writing(memory, episodes, encoder).to_dict()
     except UserError as error:
         return f"No score of writing: {error}"
     return scores if scores["tasks"] else "No score of writing: no scene has a fact that a frame shows."

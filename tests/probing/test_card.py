@@ -113,7 +113,8 @@ def reader(reads: str) -> Reader:
         episode = policy.start_episode("")
         views = {camera: image(choice)[None] for camera in policy.embodiment.camera_names}
         episode.observe(views, np.zeros((1, policy.embodiment.state.width), np.float32))
-        contents.append(policy.require_memory().gather_selection(episode.required_history(), 0).features[-1])
+        tokens = policy.require_memory().gather_selection(episode.required_history(), 0)
+        contents.append(tokens.features[tokens.mask][0])
     policy.prototypes = torch.stack(contents).float()
     return policy
 
