@@ -11,7 +11,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import Job
@@ -39,7 +39,7 @@ def probe(cfg: DictConfig) -> None:
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.card import PAGE, card_text, run_card
     from mme_vla.probing.offline import OfflineSettings
-    from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
+    from mme_vla.probing.run import IN_CLOSED_LOOP, NO_DATA, ProbePlan, run_probe
     from mme_vla.utils import safe_name
 
     values = resolved(cfg)
@@ -52,6 +52,7 @@ def probe(cfg: DictConfig) -> None:
     if values["offline"] and values["recordings"] is None and not card:
         raise UserError(NO_DATA)
     events = event_arms(values["event"])
+    require(values["online"] or not events, IN_CLOSED_LOOP)
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
     jobs = _jobs(values, settings) if values["online"] or card else []
@@ -69,7 +70,7 @@ def probe(cfg: DictConfig) -> None:
     folder = Path("outputs", "card" if card else "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, events, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
     try:
         if card:
             graded = run_card(

@@ -12,7 +12,7 @@ from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.api import load
 from mme_vla.evaluation.recordings import Recording, all_recordings
 from mme_vla.evaluation.records import EpisodeRecord
@@ -41,13 +41,16 @@ NO_DATA = (
 )
 
 
+IN_CLOSED_LOOP = "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
+
+
 @dataclass(frozen=True)
 class ProbePlan:
     """What is probed.
 
     arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
-    jobs: episodes of the closed loop, none for none. events: further arms of it, in the simulation.
-    source: where the weights are from.
+    jobs: episodes of the closed loop, none for none. source: where the weights are from.
+    events: further arms of the closed loop, in the simulation.
     """
 
     arms: Any = None
@@ -55,9 +58,9 @@ class ProbePlan:
     lend: Sequence[Recording] = ()
     jobs: Sequence[Job] = ()
     offline: OfflineSettings = field(default_factory=OfflineSettings)
-    events: Sequence[str] = ()
     shard: Shard = field(default_factory=Shard)
     source: str | None = None
+    events: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,8 @@ def probe(
     run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
     if recordings is None and tasks is None:
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
+    arms_of_events = event_arms(event)
+    require(tasks is not None or not arms_of_events, IN_CLOSED_LOOP)
     loaded, source = load(policy)
     recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
@@ -195,7 +200,7 @@ def probe(
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
-    plan = ProbePlan(arms, recorded, recorded, jobs, offline, event_arms(event), source=source)
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)
     folder = Path(output).expanduser()
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress

@@ -22,7 +22,7 @@ from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
-from mme_vla.evaluation.rollout.events import Event, event_arms, read_events
+from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RecordLog
 from mme_vla.processing.normalise import NormStats
@@ -90,11 +90,12 @@ def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
 
 
 def test_events_of_no_length_equal_the_plain_run_to_the_last_bit(policy: MMEPolicy) -> None:
+    jobs = JOBS[2:4]
     made = [
-        {r.key: facts(r) for r in roll(policy, JOBS, InlineEnvs(3, base=make_moving_env), max_batch=1, event=event)}
-        for event in (None, "pause:0@step:16", "gap:0@subtask:3", "speed:1", "pause:0+gap:0@step:16")
+        {r.key: facts(r) for r in roll(policy, jobs, InlineEnvs(2, base=make_moving_env), max_batch=1, event=event)}
+        for event in (None, "pause:0@step:16+gap:0@subtask:3", "speed:1")
     ]
-    assert len(made[0]) == len(JOBS) and all(other == made[0] for other in made)
+    assert len(made[0]) == 2 and all(other == made[0] for other in made)
 
 
 def test_a_pause_holds_the_robot_and_memory_receives_its_frames(
@@ -126,6 +127,14 @@ def test_frames_of_a_gap_are_not_observed(policy: MMEPolicy, monkeypatch: pytest
         assert torch.equal(images, policy.require_processor().images([front, front[::-1]]))
         offline = policy.require_memory().gather_selection(cached_history(policy, frames, exec_start=START), count - 1)
         assert torch.allclose(selection.features, offline.features, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["framesamp_modul", "tokendrop_expert"])
+def test_images_on_demand_are_all_that_a_policy_reads_under_events(name: str) -> None:
+    policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
+    event = "pause:5@step:16+gap:4@step:16+speed:2"
+    few, every = (roll(policy, [UNMASK], InlineEnvs(), event=event, draw=draw)[0] for draw in ("needed", "all"))
+    assert facts(few) == facts(every) and few.steps == 51
 
 
 def test_a_video_can_be_faster_or_slower(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -173,15 +182,23 @@ def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) ->
     assert never.extra["events"] == [{"event": "pause:7@subtask:99", "step": None}] and never.steps == 41
 
 
-def test_an_event_of_your_own_is_registered_by_name(memoryless: MMEPolicy) -> None:
+def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
+    with pytest.raises(UserError, match="event=pause:1@subtask:1: this environment tells no sub-tasks"):
+        EventCourse(read_events("pause:1@subtask:1")).next(Any, step=0, subtask=0)  # type: ignore[arg-type]
+
+
+def test_an_event_of_your_own_is_registered_by_name(policy: MMEPolicy) -> None:
     @register("event", "rename")
     class Rename(Event):
+        hold, observed = 8, 5
+
         def act(self, episode: Any) -> None:
             episode.goal = "do something else"
 
     assert EVENTS["rename"] is Rename
-    (record,) = roll(memoryless, [UNMASK], InlineEnvs(), event="rename@step:20")
-    assert record.extra["goal"] == "do something else" and record.extra["events"][0]["step"] == 32
+    few, every = (roll(policy, [UNMASK], InlineEnvs(), event="rename@step:10", draw=d)[0] for d in ("needed", "all"))
+    assert few.extra["goal"] == "do something else" and few.extra["events"][0]["step"] == 16
+    assert facts(few) == facts(every) and few.steps == 49
 
 
 class Rail(gymnasium.Env[Any, Any]):
@@ -196,7 +213,7 @@ class Rail(gymnasium.Env[Any, Any]):
         return self._frame(), 0.0, False, False, {}
 
     def _frame(self) -> dict[str, np.ndarray]:
-        return {"front": np.full((8, 8, 3), self.time, np.uint8), "state": np.float32([self.place])}
+        return {"front": np.full((8, 8, 3), self.time, np.uint8), "state": np.array([self.place], np.float32)}
 
 
 class Rails(Environment):
@@ -271,9 +288,12 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
         event_table(records("test", [1]))
 
 
-def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task() -> None:
-    """A whole episode of the benchmark, by its own script, without images."""
+def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An episode of the benchmark, by its own script, without images, cut after the motion that follows the pause."""
     pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
+    from mme_vla.envs.interface import RoboMMEEnv
     from mme_vla.evaluation.rollouts import rollouts
 
     built = build_policy(
@@ -281,10 +301,17 @@ def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     )
     assert isinstance(built, MMEPolicy)
     built.require_processor().stats = NormStats.unit(8, 10)
-    job = [Job("PickXtimes", "test", 0)]
-    how: dict[str, Any] = {"oracle_share": 1.0, "render": False}
-    (plain,) = rollouts(built.eval(), "mme_vla", job, (), **how)
-    (paused,) = rollouts(built, "mme_vla", job, (), event="pause:30@subtask:2", **how)
-    assert plain.success and paused.success and abs(paused.steps - plain.steps - 30) < 10
-    assert len(paused.actions) == len(plain.actions)
-    assert all(np.array_equal(a, b) for a, b in zip(plain.actions[:2], paused.actions[:2], strict=True))
+    held: list[tuple[int, int, float]] = []
+    hold = RoboMMEEnv._hold
+
+    def watched(env: RoboMMEEnv, run: Any, steps: int) -> None:
+        before, count = np.array(env.task.qpos), run.count
+        hold(env, run, steps)
+        held.append((env.task.progress.index, run.count - count, float(np.abs(env.task.qpos - before)[:7].max())))
+
+    monkeypatch.setattr(RoboMMEEnv, "_hold", watched)
+    how: dict[str, Any] = {"oracle_share": 1.0, "render": False, "max_steps": 150, "event": "pause:30@subtask:2"}
+    (paused,) = rollouts(built.eval(), "mme_vla", [Job("PickXtimes", "test", 0)], (), **how)
+    ((subtask, steps, motion),) = held
+    assert paused.outcome == "timeout" and paused.steps > 150
+    assert (subtask, steps) == (1, 30) and motion < 0.05

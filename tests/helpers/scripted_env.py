@@ -32,7 +32,8 @@ class ScriptedEnv:
         self.held = 0
         self.frames: list[np.ndarray] = []
         self.states: list[np.ndarray] = []
-        self.joints, self.gripper, self.path = np.zeros(7), 0.04, 0.0
+        self.joints: np.ndarray = np.zeros(7)
+        self.gripper, self.path = 0.04, 0.0
 
     def reset(self) -> tuple[dict[str, Any], dict[str, Any]]:
         count = VIDEO.get(self.task_name, 0) + 1

@@ -6,7 +6,7 @@ One of your own is a class registered with `register("event", name)` in a module
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -161,7 +161,7 @@ def read_event(text: str) -> PlacedEvent:
     require(words.value is None or kind.dial is not None, f"{key}: {words.name} takes no number.")
     require(words.unit is None or kind.placed, f"{key}: {words.name} takes no place; leave out @{words.unit}:….")
     options = {} if words.value is None else {kind.dial: words.value}
-    event: Event = read_section(kind, options, f"event.{words.name}") if is_dataclass(kind) else kind(**options)
+    event: Event = read_section(kind, options, f"event.{words.name}")
     unit, number = words.unit or "step", words.number or 0
     check_choice(f"{key}: place", unit, ("step", "subtask"))
     least = 0 if unit == "step" else 1

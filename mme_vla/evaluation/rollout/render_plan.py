@@ -68,8 +68,8 @@ class RenderPlan:
             return None
         return self._render_request(frozenset(needed))
 
-    def of_chunk(self, running: RunningEpisode, count: int) -> RenderRequest | None:
-        """For the next `count` actions of an episode."""
+    def of_chunk(self, running: RunningEpisode, count: int, unobserved: int = 0) -> RenderRequest | None:
+        """For the next `count` frames of an episode, after so many further ones that are not observed."""
         if self._all:
             return None
         if self._sees_passing:
@@ -77,11 +77,7 @@ class RenderPlan:
         n_observed = running.episode.n_observed_frames
         stop = n_observed + count if self._robot.action.frames is not None else EVERY.stop
         frames = self._within(running.video_frames, n_observed, stop)
-        return self._render_request(frozenset(frame + running.unobserved for frame in frames))
-
-    def of_hold(self, running: RunningEpisode, steps: int, observed: int) -> RenderRequest | None:
-        """For `steps` control steps in which the robot holds its pose, of which the last ones are observed."""
-        return self.of_chunk(running, steps) if observed == steps or self._all else self._render_request(())
+        return self._render_request(frozenset(frame + running.unobserved + unobserved for frame in frames))
 
     def _render_request(self, frames: Container[int]) -> RenderRequest:
         return RenderRequest(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)

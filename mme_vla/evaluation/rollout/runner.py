@@ -231,7 +231,7 @@ class Rollout:
         if event is None:
             self._scheduler.acting.append(running)
             return
-        draw = self._render_plan.of_hold(running, event.hold, event.observed)
+        draw = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
         self.envs.send(running.worker, {"hold": event.hold, "subgoal": running.episode.subgoal, "draw": draw})
 
     def _act(self, batch: list[RunningEpisode]) -> None:
