@@ -208,27 +208,33 @@ def writing(args: argparse.Namespace) -> None:
     from mme_vla.config.composition import compose
     from mme_vla.envs.episodes import choose_episodes
     from mme_vla.envs.make import require_simulator
+    from mme_vla.memory.base import Memory
     from mme_vla.policy.mme import MMEPolicy
     from mme_vla.policy.run_folders import resolve_checkpoint
     from mme_vla.probing.evidence import record_evidence
     from mme_vla.probing.writing import REFERENCES, required_frames, score_writing, writing_table
 
     require_simulator()
-    policy, selectors = None, {
+    policy: MMEPolicy | None = None
+    selectors: dict[str, Memory | str] = {
         name: name if name in REFERENCES else build_memory(compose("inspect", [f"memory={name}", *args.set]))
         for name in args.memories
-    }  # fmt: skip
+    }
     if args.checkpoint is not None:
         policy = MMEPolicy.from_pretrained(resolve_checkpoint(args.checkpoint), trust_plugins=args.trust_plugins)
         selectors[str(policy.config.get("name") or args.checkpoint.name)] = policy.require_memory()
-    rendered = frozenset().union(*(required_frames(s) for s in selectors.values() if not isinstance(s, str)))
+    required = [required_frames(memory) for memory in selectors.values() if not isinstance(memory, str)]
+    rendered = frozenset(frame for frames in required for frame in frames)
     number = int(args.episodes) if args.episodes.isdecimal() else args.episodes
     specs = choose_episodes(args.tasks, number, args.split)
     episodes = [episode for spec in specs if (episode := record_evidence(spec, rendered)) is not None]
     if len(episodes) < len(specs):
         print(f"{len(specs) - len(episodes)} of {len(specs)} episodes are left out: the demonstrator did not succeed.")
-    results = {name: score_writing(selector, episodes, policy if policy is not None and selector is policy.memory
-                                   else None) for name, selector in selectors.items()}  # fmt: skip
+    trained = None if policy is None else policy.memory
+    results = {
+        name: score_writing(selector, episodes, policy if selector is trained else None)
+        for name, selector in selectors.items()
+    }
     table = writing_table(results)
     print(table)
     if args.output:

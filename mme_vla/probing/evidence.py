@@ -52,7 +52,10 @@ def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -
     env = make_task(spec.task, render=render, **spec.options)
     ended: dict[int, int] = {}  # number of a sub-task → the first frame after its end
     facts: dict[str, list[int]] = {}
-    boundaries, states, images, video = [], [], {}, 0
+    boundaries: list[int] = []
+    states: list[np.ndarray] = []
+    images: dict[int, np.ndarray] = {}
+    video = 0
 
     def take(step: "RecordedStep") -> None:
         nonlocal video

@@ -94,13 +94,14 @@ def score_episode(
         held[(held < 0) & shown.any(1)] = step
         if step >= exec_start:
             count = len(frames)
-            precision = float(shown.any(0).mean()) if count else 0.0
+            shows = float(shown.any(0).mean()) if count else 0.0
             missed = [comb(step + 1 - int(row.sum()), count) / comb(step + 1, count) for row in past[begun]]
-            rows.append((precision, shown[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed)))
+            rows.append((shows, shown[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed)))
     if not rows:
         return None
     lags = (held - first)[held >= 0].tolist()
-    return EpisodeWriting(*(float(value) for value in np.mean(rows, axis=0)), lags, len(facts))
+    precision, recall, chance_precision, chance_recall = np.mean(rows, axis=0).tolist()
+    return EpisodeWriting(precision, recall, chance_precision, chance_recall, lags, len(facts))
 
 
 @dataclass
@@ -176,12 +177,12 @@ def kept_frames(memory: MemoryModule, history: History, step: int) -> np.ndarray
     Raises:
         UserError: memory tokens belong to no frame, as a recurrent memory's.
     """
-    if memory.capacity <= memory.budget:
-        return np.unique(memory.select(history, step)[:, 0])
     if not memory.timed:
         raise UserError(
             f"{type(memory).__name__} makes a state of all frames that it reads and keeps none: score one that selects."
         )
+    if memory.capacity <= memory.budget:
+        return np.unique(memory.select(history, step)[:, 0])
     tokens = memory(stack_history([memory.gather_selection(history, step)]))
     ages = tokens.ages[tokens.mask].cpu().numpy()
     return np.unique(step - ages[ages == ages.round()].astype(np.int64))

@@ -67,14 +67,14 @@ def test_an_episode_without_facts_has_no_score() -> None:
 def test_the_oracle_keeps_what_is_needed_and_nothing_else() -> None:
     mean = score_writing("oracle", [synthetic()]).to_dict()["mean"]
     assert (mean["precision"], mean["recall"], mean["score"], mean["held"]) == (1, 1, 1, 1) and mean["lag"] < 4
-    assert score_writing("boundaries", [synthetic()]).to_dict()["mean"]["score"] < 0.6
+    assert score_writing("boundaries", [synthetic()]).to_dict()["mean"]["score"] < 0.7
 
 
 def test_a_memory_that_selects_by_index_is_scored_without_an_image() -> None:
     memory = FrameSamp(32, 16, budget=512, grid=4)
     assert required_frames(memory) == frozenset()
     row = score_writing(memory, [synthetic()]).to_dict()
-    assert row["mean"]["recall"] > 0.9 and 0.15 < row["mean"]["precision"] < 0.4
+    assert row["mean"]["recall"] > 0.9 and 0.3 < row["mean"]["precision"] < 0.5
     assert abs(row["mean"]["score"] - row["mean"]["chance"]) < 0.1, (
         "evenly spaced frames are no better than random ones"
     )

@@ -79,6 +79,7 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
         speed = np.linalg.norm(np.diff(arm, axis=0, prepend=arm[:1]), axis=1)
         scores, change = history.scores.until(int(frames[-1])), np.zeros(len(frames))
         change[np.searchsorted(frames, scores.frames)] = scores.values.mean(1, dtype=np.float64)
+        change[0] = change[min(1, len(change) - 1)]  # no frame comes before the first
         novelty = np.where(peaks(change), change / max(change.max(), np.finfo(float).tiny), 0)
         value = closes + peaks(-speed) + novelty
         value[[0, -1]] = np.inf

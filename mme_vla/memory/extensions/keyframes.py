@@ -1,10 +1,10 @@
 """Keyframes: a write head says at which frames a sub-task begins, and these frames are kept whole (EventVLA).
 
 After EventVLA, whose head predicts keyframes from the hidden state of an action chunk, keeps those that are certain
-enough, and suppresses neighbours. A memory here stands before the language model, so that the head reads what a frame
-looks like and how it differs from the stored frame before it. What it learns from are the sub-tasks of the dataset: a
-stored frame is a keyframe where a sub-task has begun since the stored frame before it. Without labels, as in nano, the
-action loss alone teaches it, through a straight-through sigmoid as in `learned_topk`.
+enough beside a few anchors, and suppresses neighbours. A memory here stands before the language model, so that the head
+reads what a frame looks like and how it differs from the stored frame before it. What it learns from are the sub-tasks
+of the dataset: a stored frame is a keyframe where a sub-task has begun since the stored frame before it. Without
+labels, as in nano, the action loss alone teaches it, through a straight-through sigmoid as in `learned_topk`.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ LOWEST = 1e4  # beyond any score
 
 @MEMORIES.register("keyframes")
 class Keyframes(PerceptualMemory, ReadsLabels):
-    """The current frame and the `budget / grid² − 1` stored ones that the head is most certain of, in time order."""
+    """The first frame, the newest stored one, and `budget / grid² − 2` that the head is most certain of."""
 
     reads_labels = (LABEL,)
 
@@ -55,7 +55,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
             hidden: width of the head; None is a quarter of `d_vision`, at least 64.
         """
         check_sizes("memory", every=every, pool=pool)
-        frames = whole_frames(budget, grid, at_least=2)
+        frames = whole_frames(budget, grid, at_least=3)
         require(
             frames <= pool, f"memory.pool={pool}: the frames of memory.budget={budget} are {frames}, so at least that."
         )
@@ -105,13 +105,14 @@ class Keyframes(PerceptualMemory, ReadsLabels):
     def kept(self, scores: Tensor, valid: Tensor) -> Tensor:
         """Which frames are kept: int64 [b, frames], ascending, padding last.
 
-        Highest scores first, those lower than a neighbour's after all others; the newest frame in any case.
+        Highest scores first, those lower than a neighbour's after all others. The first frame and the newest in any
+        case.
         """
         ranks = scores.detach().masked_fill(~valid, -2 * LOWEST)
         highest = functional.max_pool1d(ranks[:, None], 3, 1, 1)[:, 0]
         ranks = ranks - LOWEST * (ranks < highest)
         newest = valid.sum(1, keepdim=True) - 1
-        ranks = ranks.scatter(1, newest, LOWEST)
+        ranks = ranks.scatter(1, torch.cat([torch.zeros_like(newest), newest], 1), LOWEST)
         return ranks.topk(self.frames, dim=1).indices.sort(1).values
 
 
@@ -121,7 +122,7 @@ def write_loss(scores: Tensor, subtask: Tensor, valid: Tensor) -> Tensor:
     Args:
         subtask: the number of each frame's sub-task, [b, t]. valid: bool [b, t].
     """
-    begins = torch.diff(subtask, dim=1, prepend=subtask[:, :1] - 1).ne(0)
+    begins = torch.diff(subtask, dim=1, prepend=subtask[:, :1]).ne(0)
     losses = functional.binary_cross_entropy_with_logits(scores, begins.to(scores.dtype), reduction="none")
     sides = [(losses * side).sum(1) / side.sum(1).clamp(min=1) for side in (begins & valid, ~begins & valid)]
     return (sides[0] + sides[1]) / 2

@@ -340,7 +340,7 @@ class UnmaskSwap(Task):
         nearest = [Swap(thing, inner, start + i * steps, steps=steps) for i, thing in enumerate(self.initiators)]
         swaps = nearest if self.pairs is None else planned_swaps(self.pairs, inner, start, steps)
         cover = Cover(inner, groups["inner"])
-        self.shown = [cover, *swaps]
+        self.shown: list[Cover | Swap] = [cover, *swaps]
         self.motions: list[Cover | Swap | Hide] = [
             cover,
             Cover(outer, groups["outer"]),
