@@ -48,6 +48,8 @@ def main(cfg: DictConfig) -> None:
 
 def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
+    import torch
+
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import named_tasks
@@ -69,7 +71,10 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     settings = RolloutSettings.from_config({**values, "event": None})
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
-        repeat_exactly()
+        # PyTorch takes kernels whose results repeat; where an operation has none, it warns.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        torch.backends.cudnn.benchmark = False
     jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
     shard = choose_shard(values["shard"])
     environment(settings.env).check_installed()
@@ -90,7 +95,8 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
     notes["deterministic"] = values["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
-    _use_spawn()
+    if multiprocessing.get_start_method() == "loky":  # a job of joblib: a worker of ours cannot look that way up
+        multiprocessing.set_start_method("spawn", force=True)
     try:
         done = evaluate_events(
             with_sessions(policy, settings.split, recordings), jobs, output, facts, settings, events,
@@ -102,15 +108,6 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
             report_usage(subgoals.usage)
             subgoals.close()
     report(done, output)
-
-
-def repeat_exactly() -> None:
-    """Have PyTorch choose kernels whose results repeat; where an operation has none, it warns."""
-    import torch
-
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
-    torch.use_deterministic_algorithms(True, warn_only=True)
-    torch.backends.cudnn.benchmark = False
 
 
 def choose_device(name: str) -> "torch.device":
@@ -207,9 +204,3 @@ def report_usage(usage: "Usage") -> None:
     words += [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
     if words:
         logger.info("subgoals: %s", ", ".join(words))
-
-
-def _use_spawn() -> None:
-    """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
-    if multiprocessing.get_start_method() == "loky":
-        multiprocessing.set_start_method("spawn", force=True)

@@ -3,7 +3,6 @@
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
@@ -12,13 +11,6 @@ from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
 from mme_vla.errors import UserError, require
-
-if TYPE_CHECKING:
-    from mme_vla.envs.vector.pool import Job
-    from mme_vla.evaluation.recordings import Recording
-    from mme_vla.evaluation.rollout.settings import RolloutSettings
-    from mme_vla.policy.base import Policy
-
 
 logger = logging.getLogger("mme_vla.probe")
 
@@ -33,18 +25,23 @@ def main() -> None:
 @cli("probe")
 def probe(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
+    from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
-    from mme_vla.evaluation.rollout.evaluation import choose_shard, facts_of
+    from mme_vla.envs.episodes import choose_numbers, named_tasks
+    from mme_vla.evaluation.recordings import all_recordings
+    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, facts_of
     from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.card import PAGE, card_text, run_card
     from mme_vla.probing.offline import OfflineSettings
-    from mme_vla.probing.run import IN_CLOSED_LOOP, NO_DATA, ProbePlan, run_probe
+    from mme_vla.probing.report import table_of
+    from mme_vla.probing.run import IN_CLOSED_LOOP, NO_DATA, ProbePlan, probed_folder, run_probe
     from mme_vla.utils import safe_name
 
     values = resolved(cfg)
-    if values["compare"] is not None:
-        print(_table(values["compare"]))
+    if (folders := values["compare"]) is not None:
+        listed = [folders] if isinstance(folders, str) else list(folders)
+        print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
         return
     card = values["card"]
     if not (values["offline"] or values["online"] or card):
@@ -55,15 +52,19 @@ def probe(cfg: DictConfig) -> None:
     require(values["online"] or not events, IN_CLOSED_LOOP)
     settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
-    jobs = _jobs(values, settings) if values["online"] or card else []
+    jobs = []
+    if values["online"] or card:
+        jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
     shard = choose_shard(values["shard"])
     if jobs:
         environment(settings.env).check_installed()
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
-    recordings = _recordings(values["recordings"], policy)
-    probed = _select(recordings, values["recorded"]) if values["offline"] else []
+    data = values["recordings"]
+    recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))
+    numbers = choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
+    probed = [recordings[i] for i in numbers]
     subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device) if jobs else None
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
@@ -86,33 +87,3 @@ def probe(cfg: DictConfig) -> None:
             subgoals.close()
     print(text)
     print(page)
-
-
-def _jobs(values: dict[str, Any], settings: "RolloutSettings") -> "list[Job]":
-    """The episodes of the closed loop."""
-    from mme_vla.envs.episodes import named_tasks
-    from mme_vla.evaluation.rollout.evaluation import choose_episodes
-
-    return choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
-
-
-def _recordings(data: Any, policy: "Policy") -> "list[Recording]":
-    from mme_vla.data.sources import open_sources
-    from mme_vla.evaluation.recordings import all_recordings
-
-    return [] if data is None else all_recordings(open_sources(data, policy.embodiment))
-
-
-def _select(recordings: "list[Recording]", which: Any) -> "list[Recording]":
-    """The recorded episodes that are probed, by the grammar of all commands."""
-    from mme_vla.envs.episodes import choose_numbers
-
-    return [recordings[i] for i in choose_numbers(which, len(recordings), "the data")]
-
-
-def _table(folders: Any) -> str:
-    from mme_vla.probing.report import table_of
-    from mme_vla.probing.run import probed_folder
-
-    listed = [folders] if isinstance(folders, str) else list(folders)
-    return table_of({folder: probed_folder(Path(folder)) for folder in listed})

@@ -170,14 +170,14 @@ class EpisodeEnv:
     ) -> None:
         self.environment, self.env, self.spec = environment, env, spec
         self.max_steps, self._by_choice = max_steps, by_choice
-        self._goal, self._steps, self._limit = "", 0, max_steps
+        self.goal, self._steps, self._limit = "", 0, max_steps
         self._choices: dict[str, Actions] = {}
 
     def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
         """The conditioning video, if there is one, and the current frame."""
         observation, info = self.env.reset(seed=self.spec.seed)
         require(isinstance(info.get("goal"), str), f"{self.spec.task}: reset() must return the goal in info['goal'].")
-        self._goal, self._steps, self._limit = info["goal"], 0, self.max_steps
+        self.goal, self._steps, self._limit = info["goal"], 0, self.max_steps
         return self._lists([*info.get("video", ()), observation]), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
@@ -215,7 +215,7 @@ class EpisodeEnv:
     def demonstration(self) -> Iterator[tuple[Mapping[str, Any], Any, bool]]:
         """Observation, action and whether the frame is of the conditioning video, until the demonstrator is done."""
         observation, info = self.env.reset(seed=self.spec.seed)
-        self._goal = str(info["goal"])
+        self.goal = str(info["goal"])
         self.success = False
         actions = self.environment.demonstrate(self.env)
         first = next(actions, None)
@@ -230,11 +230,6 @@ class EpisodeEnv:
             if terminated or truncated or (action := next(actions, None)) is None:
                 return
 
-    @property
-    def goal(self) -> str:
-        """Of the running episode."""
-        return self._goal
-
     def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         lists: dict[str, list[Any]] = {"state_list": [np.asarray(frame["state"], np.float32) for frame in frames]}
         cameras = [name for name in frames[0] if name != "state"] if frames else []
@@ -247,7 +242,7 @@ class EpisodeEnv:
         success = bool(info.get("success", False))
         over = "fail" if terminated else "timeout" if truncated else "ongoing"
         report: dict[str, Any] = {
-            "task_goal": [self._goal],
+            "task_goal": [self.goal],
             "status": "success" if success and (terminated or truncated) else over,
             "simple_subgoal_online": str(info.get("subgoal", "")),
         }

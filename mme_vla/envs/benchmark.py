@@ -31,7 +31,6 @@ class RoboMME(Environment):
         return metadata.step_limit(split)
 
     def check_installed(self) -> None:
-        """The simulator."""
         make.require_simulator()
 
     def check_embodiment(self, robot: Embodiment) -> None:
@@ -39,7 +38,6 @@ class RoboMME(Environment):
         check_benchmark(robot, make.ACTION_SPACES)
 
     def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
-        """From the benchmark's metadata."""
         return metadata.episodes(task, split)
 
     def make(self, spec: EpisodeSpec, render: bool = True) -> Any:
@@ -50,7 +48,6 @@ class RoboMME(Environment):
         """Every episode takes a `Hold`."""
 
     def open(self, task: str, split: str, episode: int, **options: Any) -> Any:
-        """As `make_env`."""
         return make.make_env(task, split, episode, env=self.name, **options)
 
 

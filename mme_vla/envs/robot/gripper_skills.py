@@ -51,7 +51,7 @@ def pointing_down(forward: np.ndarray) -> np.ndarray:
 
 def turned(q: np.ndarray, axis: str, angle: float) -> np.ndarray:
     """An orientation wxyz turned about one of its own axes by an angle in radians."""
-    return wxyz(Rotation.from_quat(np.roll(q, -1)) * Rotation.from_euler(axis, angle))
+    return (sapien.Pose(q=q) * sapien.Pose(q=np.roll(Rotation.from_euler(axis, angle).as_quat(), 1))).q
 
 
 def wxyz(rotation: Rotation) -> np.ndarray:

@@ -108,7 +108,11 @@ class Swap:
         if not self.active:
             return
         if k == self.start:
-            self._begin()
+            self._poses = {thing: thing.pose for thing in self._group}
+            if self.partner is None:
+                origin = self.initiator.position
+                others = [thing for thing in self._group if thing is not self.initiator]
+                self.partner = min(others, key=lambda thing: distance_xy(thing.position, origin))
         assert self.partner is not None
         a, b = self._poses[self.initiator], self._poses[self.partner]
         alpha = smoothstep((k - self.start) / self.steps)
@@ -124,13 +128,6 @@ class Swap:
                 thing.move_to(sapien.Pose([*(b.p[:2] - arc), b.p[2]], blend(b.q, a.q, alpha)))
             else:
                 thing.move_to(pose)
-
-    def _begin(self) -> None:
-        self._poses = {thing: thing.pose for thing in self._group}
-        if self.partner is None:
-            origin = self.initiator.position
-            others = [thing for thing in self._group if thing is not self.initiator]
-            self.partner = min(others, key=lambda thing: distance_xy(thing.position, origin))
 
 
 def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:

@@ -15,12 +15,7 @@ from mme_vla.envs.scene.motions import (
     under,
 )
 from mme_vla.envs.scene.objects import COLOURS, RGB, Cube
-from mme_vla.envs.scene.placement import (
-    ANCHOR_HALF,
-    Draws,
-    Region,
-    rotated_anchors,
-)
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Draws, Region, rotated_anchors
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, pressed
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task

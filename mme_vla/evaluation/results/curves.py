@@ -13,7 +13,7 @@ from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Interval, Results, wilson
 from mme_vla.evaluation.results.plots import COLOURS, figure, svg
-from mme_vla.evaluation.results.tables import Table, task_table
+from mme_vla.evaluation.results.tables import Table, task_tables
 
 
 @dataclass(frozen=True)
@@ -137,12 +137,7 @@ def process_of(record: EpisodeRecord) -> ProcessScore | None:
 def process_tables(results: Results) -> list[Table]:
     """Where the chains broke, a table of every method that has scores, over all its runs."""
     columns = ["", "episodes", "progress (%)", "success", *OPERATIONS, MOTION, "stuck"]
-    tables = []
-    for method in results.methods:
-        records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
-        title = f"{method.label}: where the chain broke"
-        tables += task_table(title, columns, records, results.protocol.tasks, _row)
-    return tables
+    return task_tables(results, EXTRA, "where the chain broke", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:

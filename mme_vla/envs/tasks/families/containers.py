@@ -15,24 +15,8 @@ from mme_vla.envs.scene.motions import (
     planned_swaps,
     under,
 )
-from mme_vla.envs.scene.objects import (
-    COLOURS,
-    CONTAINER_OUTER,
-    Container,
-    Cube,
-    H,
-    build_container,
-    build_hidden_cube,
-)
-from mme_vla.envs.scene.placement import (
-    ANCHOR_HALF,
-    Avoid,
-    Draws,
-    Point,
-    Region,
-    SceneError,
-    draw_container,
-)
+from mme_vla.envs.scene.objects import COLOURS, CONTAINER_OUTER, Container, Cube, H, build_container, build_hidden_cube
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Avoid, Draws, Point, Region, SceneError, draw_container
 from mme_vla.envs.scene.predicates import container_picked_up, container_put_down
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
