@@ -11,7 +11,7 @@ from pathlib import Path
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
-from mme_vla.errors import UserError, printable
+from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
@@ -46,13 +46,30 @@ DEMO = (
 
 
 EXAMPLES = ("outputs/evaluation --html report.html", "runs/a runs/b --compare framesamp_modul pi05", "--demo --brief")
+VERIFY_EXAMPLES = ("outputs/evaluation/framesamp_modul/80000/seed42", "receipt.json --checkpoint downloads/step_080000")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Read, aggregate, compare, print, write."""
-    args = _parser().parse_intermixed_args(arguments)
+    """Read, aggregate, compare, print, write; or check receipts."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    checks = words[:1] == ["verify"]
+    args = _verify_parser().parse_args(words[1:]) if checks else _parser().parse_intermixed_args(words)
     with print_user_errors():
-        run(args)
+        (verify if checks else run)(args)
+
+
+def verify(args: argparse.Namespace) -> None:
+    """Check receipts, print what differs, and end with code 1 if anything does."""
+    from mme_vla.evaluation import receipts
+
+    paths = [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
+    require(paths, f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or below.")
+    results = {path: receipts.verify(path, args.checkpoint) for path in paths}
+    for path, (differences, notes) in results.items():
+        print(f"{path}: {'differs' if differences else 'agrees'}")
+        print("".join(f"  {printable(line)}\n" for line in [*differences, *(f"note: {n}" for n in notes)]), end="")
+    if any(differences for differences, _ in results.values()):
+        raise SystemExit(1)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -189,6 +206,13 @@ def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[
         return [(first, second)]
     results.notes.append(f"{first.label} and {second.label} have no episode in common, and are not compared.")
     return []
+
+
+def _verify_parser() -> argparse.ArgumentParser:
+    parser = argument_parser("mme-vla results verify", "Check receipts of runs, without a network.", VERIFY_EXAMPLES)
+    parser.add_argument("receipt", type=Path, help="receipt.json, or a folder with receipts in it or below")
+    parser.add_argument("--checkpoint", type=Path, help="its folder on this machine, if another than in the receipt")
+    return parser
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, listed, require
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
@@ -184,12 +184,20 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         policy.processor = load_processor(opened.folder)
         check_processor(policy, str(opened.folder))
         return policy
-    words, declared = list(overrides), opened.model
+    words, variants = list(overrides), opened.variants
     named = [word.partition("=")[2] for word in words if word.startswith("model=")]
-    if declared is not None and named and named[-1] != declared:
-        raise UserError(f"{opened.folder} says it is {declared}, but model={named[-1]} was given.")
+    if variants and named and named[-1] not in variants:
+        raise UserError(f"{opened.folder} says it is {listed(variants)}, but model={named[-1]} was given.")
     if not named:
-        words.insert(0, f"model={declared or 'pi05'}")
+        require(
+            len(variants) < 2,
+            f"history_config.txt beside {opened.folder} names no variant of the released code, and its tensors are "
+            f"those of {listed(variants)}: name one of these, such as model={variants[0] if variants else ''}.",
+        )
+        words.insert(0, f"model={variants[0] if variants else 'pi05'}")
+    if opened.lacks_positions and not any(word.startswith("memory.positions=") for word in words):
+        words.append("memory.positions=none")
+    print(f"Reading {opened.label} as {' '.join(words)}", file=sys.stderr)
     if not any(word.startswith("backbone=") for word in words):
         words.append(f"backbone={compose('policy', words).full_size}")
     from mme_vla.policy.build import build_from_config

@@ -12,7 +12,8 @@ import math
 import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,13 +88,13 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
                 inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
             if not place.is_dir():  # tensorstore would wait for a pipe without end
                 require_file(place, "a part of an Orbax checkpoint")
-    ocdbt = (params / MANIFEST).is_file() if isinstance(params, Path) else MANIFEST in params.names
-    try:
-        arrays = _list_arrays(ts, params, ocdbt)
+    with _reading(params):
+        arrays = _list_arrays(ts, params)
         pending = {
             # A part that is missing would otherwise be read as zeros. Orbax and this library write zeros like the rest.
             name: ts.open(
-                {"driver": driver, "kvstore": _store(params, path, ocdbt), "fill_missing_data_reads": False},
+                {"driver": driver, "kvstore": _store(params, path, _is_ocdbt(params)),
+                 "fill_missing_data_reads": False},
                 open=True, read=True,
             )
             for path, (name, driver) in arrays.items()
@@ -111,13 +112,26 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
             fits({name: torch.empty(store.shape, device="meta") for name, store in stores.items()})
         reads = {name: store.read() for name, store in stores.items()}
         tree = {name: _to_tensor(read.result()) for name, read in reads.items()}
-    except UserError:
-        raise
-    except (ValueError, TypeError, RuntimeError, OverflowError) as error:  # what tensorstore, or torch, cannot read
-        reason = brief(str(error).splitlines()[0], 500, quote=False)
-        raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
     require(tree, f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
+
+
+def leaf_names(params: Path | Zipped) -> set[str]:
+    """The names of a checkpoint's arrays, as `read_orbax` gives them; no array is read."""
+    with _reading(params):
+        return {name for name, _ in _list_arrays(_tensorstore(), params).values()}
+
+
+@contextmanager
+def _reading(params: Path | Zipped) -> Iterator[None]:
+    """Report what tensorstore, or torch, cannot read."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:
+        reason = brief(str(error).splitlines()[0], 500, quote=False)
+        raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
@@ -153,8 +167,12 @@ def _holds_arrays(folder: Path) -> bool:
     return (folder / MANIFEST).is_file() or any(next(folder.glob(f"*{name}"), None) for name in ARRAY_FILES)
 
 
-def _list_arrays(ts: Any, params: Path | Zipped, ocdbt: bool) -> dict[str, tuple[str, str]]:
-    if ocdbt:
+def _is_ocdbt(params: Path | Zipped) -> bool:
+    return MANIFEST in params.names if isinstance(params, Zipped) else (params / MANIFEST).is_file()
+
+
+def _list_arrays(ts: Any, params: Path | Zipped) -> dict[str, tuple[str, str]]:
+    if _is_ocdbt(params):
         keys = [key.decode() for key in ts.KvStore.open(_store(params, "", True)).result().list().result()]
     elif isinstance(params, Zipped):
         keys = [key for key in params.names if key.count("/") == 1]

@@ -1,22 +1,25 @@
 """What a user points at: which format it is in, and its tensors under that format's names."""
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, did_you_mean, listed, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.utils import decoding, require_file
+from mme_vla.weights.names.jax_memory import ENCODER
 from mme_vla.weights.orbax import (
     ARCHIVE_SUFFIX,
     Zipped,
     find_archive,
     find_params,
+    leaf_names,
     open_archive,
     read_orbax,
     variant_of,
@@ -154,25 +157,54 @@ class Source:
 
     @property
     def model(self) -> str | None:
-        """Our name of the variant a checkpoint is, or None where it does not say."""
+        """Our name of the variant a checkpoint is, or None where neither words nor tensors tell one."""
+        return self.variants[0] if len(self.variants) == 1 else None
+
+    @cached_property
+    def variants(self) -> list[str]:
+        """Our names of the variants that a checkpoint may be; none where it does not say.
+
+        A word in `history_config.txt` that is no variant of the released code never becomes part of a configuration:
+        the names of the tensors tell the variant.
+        """
         if self.format in (*NATIVE_FORMATS, "simplememvla"):
-            return self.format
+            return [self.format]
         if self.format == "openvla":
-            return "openvla_oft"
-        name = None
-        if self.params is not None:
-            place = self.params.file if isinstance(self.params, Zipped) else self.params
-            beside = [place.parent, place.parent.parent]
-            name = variant_of([self.folder, *beside])
-            if name is None:  # published runs lie in folders that are called as they are
-                name = next((folder.name for folder in beside if folder.name in VARIANTS), None)
-        # The word would become part of a configuration, where it could ask for more than a name.
-        require(
-            name is None or name in VARIANTS,
-            f"history_config.txt beside {self.folder} says {brief(name)}, no variant of the released code. "
-            f"{did_you_mean(brief(name), VARIANTS)}",
-        )
-        return None if name is None else VARIANTS[name]
+            return ["openvla_oft"]
+        if self.params is None:
+            return []
+        place = self.params.file if isinstance(self.params, Zipped) else self.params
+        beside = [place.parent, place.parent.parent]
+        word = variant_of([self.folder, *beside])
+        if word is not None and word not in VARIANTS:
+            return _variants_with(leaf_names(self.params), word)
+        if word is None:  # published runs lie in folders that are called as they are
+            word = next((folder.name for folder in beside if folder.name in VARIANTS), None)
+        return [] if word is None else [VARIANTS[word]]
+
+    @property
+    def lacks_positions(self) -> bool:
+        """Whether a released memory was trained without position features (`use_pos_emb: false`)."""
+        leaves = set() if self.params is None else leaf_names(self.params)
+        return any(leaf.startswith(ENCODER) for leaf in leaves) and f"{ENCODER}/pos_proj/kernel" not in leaves
+
+
+def _variants_with(leaves: Collection[str], word: str) -> list[str]:
+    """Our names of the released variants whose trees have such leaves.
+
+    The tensors of FrameSamp and TokenDrop have the same names. Where `word` has neither name in it, it is one of both.
+    """
+
+    def has(part: str) -> bool:
+        return any(part in leaf for leaf in leaves)
+
+    if not has(ENCODER):
+        return ["pi05", "simplesg", "groundsg"]
+    integration = "modul" if has("/mem_attn/") else "expert" if has("final_norm_mem") else "context"
+    perceptual = [name for name in ("framesamp", "tokendrop") if name in word] or ["framesamp", "tokendrop"]
+    recurrent = {"recur_layer/W1": ["ttt"], "recur_layer/memory_state": ["rmt"]}
+    memories = next((names for leaf, names in recurrent.items() if has(leaf)), perceptual)
+    return [f"{memory}_{integration}" for memory in memories]
 
 
 def detect_format(source: str | Path) -> str:

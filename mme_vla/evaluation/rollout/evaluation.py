@@ -12,6 +12,7 @@ from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, require
+from mme_vla.evaluation.receipts import receipt
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.events import folder_of, read_events
@@ -151,7 +152,7 @@ def evaluate(
     check_sessions(settings.split, _n_distractors(policy))
     if base is make_env:
         environment(settings.env).check_embodiment(policy.embodiment)
-    claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
+    run = claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
     shard = shard or Shard()
     with RecordLog(output / shard.file) as log:
         remove_drafts(output / VIDEOS)  # videos of workers that were killed
@@ -171,7 +172,8 @@ def evaluate(
             workload = Workload()
             if envs is not None:
                 folder = output / SUBGOALS if settings.subgoal_log else None
-                with envs:
+                renders = base is make_env and settings.render
+                with envs, receipt(output / shard.file, policy, run, source, renders):
                     rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress, workload)
                     rollout.run(waiting)
     return Evaluation(_done(output, jobs, facts, shard), workload)

@@ -16,9 +16,9 @@ LAYER = "mem_encoder/recur_layer"
 def released_names(memory: Memory) -> NameTable:
     """The table of a memory; empty where no released checkpoint has one (a memory of one's own)."""
     if isinstance(memory, PerceptualMemory):
-        return _encoder("encoder_static")
+        return _encoder(memory, "encoder_static")
     if isinstance(memory, RecurrentMemory) and isinstance(memory.layer, TTTLayer | RMTLayer):
-        table = _encoder("encoder_recur") | prefixed("output", linear("mem_encoder/proj"))
+        table = _encoder(memory, "encoder_recur") | prefixed("output", linear("mem_encoder/proj"))
         return table | prefixed("layer", layer_names(memory.layer))
     return {}
 
@@ -87,6 +87,8 @@ def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
     )
 
 
-def _encoder(project: str) -> NameTable:
-    table = prefixed("encoder.position", linear(f"{ENCODER}/pos_proj"))
-    return table | prefixed("encoder.project", linear(f"{ENCODER}/{project}"))
+def _encoder(memory: Memory, project: str) -> NameTable:
+    table = prefixed("encoder.project", linear(f"{ENCODER}/{project}"))
+    if any(name.startswith("encoder.position.") for name, _ in memory.named_parameters()):
+        table |= prefixed("encoder.position", linear(f"{ENCODER}/pos_proj"))
+    return table
