@@ -23,7 +23,8 @@ SIZES: dict[str, dict[str, Any]] = {
     "ttt": {"budget": 16, "max_steps": 8, "max_video": 4}, "rmt": {"budget": 16, "max_steps": 8, "max_video": 4},
     "retrieval": {"budget": 64, "every": 2, "longest": 3}, "moment": {"budget": 16, "moments": 2, "grid": 2},
     "gist": {"budget": 48, "anchors": 1, "recent": 1, "gists": 4, "stride": 8},
-    "present": {"grid": 4}, "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "learned_topk": {"budget": 32, "pool": 6},
+    "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "present": {"grid": 4},
+    "learned_topk": {"budget": 32, "pool": 6},
     "spacetime": {"stride": 4}, "bank": {"budget": 16, "grid": 4, "moments": 4, "video": 2, "hidden": 32, "length": 3},
 }  # fmt: skip
 
