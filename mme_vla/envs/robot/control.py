@@ -135,7 +135,8 @@ class RobotControl:
     def _plan(self, pose: sapien.Pose) -> np.ndarray:
         velocity, acceleration = LIMITS[self.env.stick]
         # The screw planner has no randomness: what fails once fails always.
-        plan = plan_screw(self.arm, self.env.qpos, pose, velocity, acceleration)
+        qpos = np.asarray(self.env.qpos, np.float64 if self.env.stick else np.float32)
+        plan = plan_screw(self.arm, qpos, pose, velocity, acceleration)
         if plan is not None:
             return plan
         for seed in range(FREE_TRIES):

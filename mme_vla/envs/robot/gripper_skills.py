@@ -14,8 +14,8 @@ from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import Thing
 
 DOWN = np.array([0.0, 0.0, -1.0])
-DOWNWARD_Q = (0.0, 1.0, 0.0, 0.0)
-"""The gripper straight down, its x axis along the world's (roll pi); wxyz."""
+DOWNWARD_Q = (float(np.cos(np.float32(np.pi / 2))), 1.0, 0.0, 0.0)
+"""The gripper straight down, its x axis along the world's (roll pi in single precision, as recorded); wxyz."""
 SQUARE = 0.01
 """Two sides whose ratio is within this of 1 are equally good to grasp."""
 
@@ -36,7 +36,10 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
         first = second
     across = axes[first] * (1 if closing @ axes[first] >= 0 else -1)
     across = across - (across @ DOWN) * DOWN
-    return pointing_down(np.cross(across, DOWN))
+    across /= np.linalg.norm(across)
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([np.cross(across, DOWN), across, DOWN], axis=1)
+    return sapien.Pose(frame).q
 
 
 def pointing_down(forward: np.ndarray) -> np.ndarray:
@@ -48,7 +51,7 @@ def pointing_down(forward: np.ndarray) -> np.ndarray:
 
 def turned(q: np.ndarray, axis: str, angle: float) -> np.ndarray:
     """An orientation wxyz turned about one of its own axes by an angle in radians."""
-    return wxyz(Rotation.from_quat(np.roll(q, -1)) * Rotation.from_euler(axis, angle))
+    return (sapien.Pose(q=q) * sapien.Pose(q=np.roll(Rotation.from_euler(axis, angle).as_quat(), 1))).q
 
 
 def wxyz(rotation: Rotation) -> np.ndarray:

@@ -44,7 +44,8 @@ def plan_screw(
 
     Args:
         arm: the kinematic model.
-        qpos: present joint angles, [7] or longer.
+        qpos: present joint angles, [7] or longer. The path is kept in their precision, as `mplib` keeps it: the official
+            gripper demonstrations have single precision, those of the stick double.
         target_pose: of the tool centre point in the world.
         velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
@@ -52,7 +53,7 @@ def plan_screw(
         Joint targets [n, 7], the first being the present angles; None where a joint limit is in the way, the motion
         stalls at a singularity, or the displacement turns the tool by half a turn.
     """
-    joints = np.asarray(qpos, np.float64)[:ARM_JOINTS].copy()
+    joints = np.array(qpos)[:ARM_JOINTS]
     goal = np.linalg.inv(matrix_of(arm.base)) @ matrix_of(target_pose)
     displacement = goal @ np.linalg.inv(arm.transform(joints))
     remaining = twist_of(displacement)
@@ -71,7 +72,7 @@ def plan_screw(
         arrived = bool(overshoot > 1)
         if arrived:
             step, motion = step / overshoot, motion / overshoot
-        joints = joints + step
+        joints = (joints + step).astype(joints.dtype)
         remaining = remaining - motion
         if np.linalg.norm(motion) < _STALLED or not arm.within_limits(joints):
             return None

@@ -31,7 +31,7 @@ UPRIGHT = tuple(euler2quat(0, np.pi / 2, 0))
 
 def at(xy: XY, z: float, yaw: float = 0.0) -> sapien.Pose:
     """Pose on the table, turned about the vertical; metres and radians."""
-    return sapien.Pose([float(xy[0]), float(xy[1]), z], euler2quat(0, 0, yaw))
+    return sapien.Pose([float(xy[0]), float(xy[1]), z], euler2quat(0, 0, np.float32(yaw)))
 
 
 class Shapes:
