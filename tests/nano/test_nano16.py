@@ -14,6 +14,8 @@ from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
 from mme_vla.envs.rendering import render_backend
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.nano import evaluating
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.evaluating import Rules, built_scenes, frequent_moves, play_all
@@ -21,11 +23,9 @@ from mme_vla.nano.learning import Decisions, choice_errors, statistics
 from mme_vla.policy.mme import MMEPolicy
 
 
-def policy(model: str) -> MMEPolicy:
-    return build_policy(
-        model, backbone="nano_choice", embodiment="robomme_choice_front", policy={"augment": False},
-        **{"backbone.head.temperature": 0},
-    )  # fmt: skip
+def policy(model: str, **others: object) -> MMEPolicy:
+    robot = {"backbone": "nano_choice", "embodiment": "robomme_choice_front", "backbone.head.temperature": 0}
+    return build_policy(model, policy={"augment": False}, **robot, **others)
 
 
 def chosen(letters: str, task: str = "StopCube") -> Demonstration:
@@ -44,10 +44,8 @@ def chosen(letters: str, task: str = "StopCube") -> Demonstration:
 
 
 def test_present_gives_the_current_frame_and_as_many_parameters_as_a_memory() -> None:
-    present, remembering = (
-        build_policy(f"{memory}_modul", backbone="nano", embodiment="robomme_choice_front", policy={"augment": False},
-                     memory=options) for memory, options in (("present", {"grid": 4}), ("framesamp", {"budget": 16}))
-    )  # fmt: skip
+    present = policy("present_modul", memory={"grid": 4})
+    remembering = policy("framesamp_modul", memory={"budget": 16})
     counts = [sum(p.numel() for p in part.parameters()) for part in (present, remembering)]
     assert counts[0] == counts[1] and present.require_memory().budget == 16
     assert present.frames_read(np.array([3, 9]), 0).tolist() == [3, 9]
@@ -86,6 +84,19 @@ def test_what_is_not_possible_is_listed_and_not_chosen() -> None:
     scores[0, 1] = 1
     assert space.decide(torch.from_numpy(scores), options)[0, :2].tolist() == [1, 0]
     assert "b pick up" in space.worded("do it", options)
+
+
+def test_what_is_possible_is_asked_again_after_each_choice() -> None:
+    def info(possible: bool) -> dict[str, object]:
+        option = {"label": "b", "action": "pick up", "need_parameter": False, "possible": possible}
+        return {"task_goal": ["do it"], "available_multi_choices": [option], "executed": 1, "steps": 1}
+
+    frames = {"state": np.zeros((1, 8), np.float32), "front": [np.zeros((256, 256, 3), np.uint8)]}
+    running = RunningEpisode(policy("pi05"), Job("StopCube", "test", 0), 0, None, 32, None)
+    running.begin(frames, info(False))
+    assert not running.episode.options[0].possible
+    running.resume(frames, info(True))
+    assert running.episode.options[0].possible
 
 
 def test_scenes_that_cannot_be_built_are_replaced_and_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,8 +69,7 @@ class RunningEpisode:
         """Take the first observation: a conditioning video, if the task has one, and the current frame."""
         goal = str(info["task_goal"][0])
         self.episode.goal = goal
-        if self._robot.action.choice and OPTIONS in info:
-            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
+        self._offer(info)
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
             needs_video = self.video_frames and self._subgoals.sees_video
@@ -80,9 +79,15 @@ class RunningEpisode:
 
     def resume(self, frames: Observation, info: dict[str, Any]) -> None:
         """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
+        self._offer(info)
         count = self._count(info)
         n_frames = count if self._robot.action.frames is not None else len(frames["state"])
         self._expect(frames, np.zeros(n_frames, bool), self._sent[:count], info)
+
+    def _offer(self, info: dict[str, Any]) -> None:
+        """Let the episode choose among the options of now: which of them are possible may change."""
+        if self._robot.action.choice and OPTIONS in info:
+            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
 
     def end(self, info: dict[str, Any]) -> None:
         """Take the report of the last actions; their frames are not needed any more."""
