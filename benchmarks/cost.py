@@ -1,4 +1,4 @@
-"""What each of the 17 models costs: FLOPs counted at full size, time and peak memory measured at tiny size.
+"""What every model costs: FLOPs counted at full size, time and peak memory measured at tiny size.
 
     python benchmarks/cost.py [--count] [--budgets] [--time] [--memory] [--models …]     (all four without a choice)
 

@@ -22,7 +22,7 @@ def lerobot_row(setup: Setup) -> dict[str, Any]:
     """
     device, b = setup.device, setup.batch
     full = setup.backbone == "pi05"
-    source = lerobot_pi05("bfloat16" if device.type == "cuda" else "float32", reduced=not full).to(device)
+    source: Any = lerobot_pi05("bfloat16" if device.type == "cuda" else "float32", reduced=not full).to(device)
     time = torch.full((b,), 0.5, device=device)
 
     def inputs(rows: int) -> tuple[Any, ...]:

@@ -13,6 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from mme_vla import MMEPolicy, build_policy
 from mme_vla.evaluation.analyses.cost import flops
 from mme_vla.memory.recurrent import RecurrentMemory
+from mme_vla.speed import HasAttentionBackends
 from mme_vla.types import Batch
 
 PEAKS = {"H100 PCIe": 756, "H100": 989, "H200": 989, "GH200": 989, "B200": 2250, "A100": 312, "A40": 150, "L40S": 362,
@@ -110,7 +111,9 @@ def built(model: str, backbone: str, device: torch.device, attention: str = "aut
         options["policy.compute_dtype"] = "bfloat16"
     policy = build_policy(model, backbone=backbone, device=device, **options)
     assert isinstance(policy, MMEPolicy)
-    policy.backbone.set_attention_backend(attention)
+    backbone_module = policy.backbone
+    assert isinstance(backbone_module, HasAttentionBackends)
+    backbone_module.set_attention_backend(attention)
     policy.backbone.vision.requires_grad_(False)
     return policy.train()
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode, conv_flop_count
 
 from mme_vla import build_policy
 from mme_vla.evaluation.analyses.cost import flops, on_meta
@@ -54,13 +55,32 @@ def measure_time(steps: int, every: int) -> None:
 
 def count() -> None:
     """Parameters and FLOPs at full size."""
-    print("| model | parameters | forward pass | sampled chunk |\n|---|---:|---:|---:|")
+    print("| model | parameters | forward pass | sampled chunk | update | update, frozen tower |")
+    print("|---|---:|---:|---:|---:|---:|")
     for model in COMPARED:
         policy: Any = on_meta(model)
         batch = policy.full_batch("meta")
-        numbers = [flops(lambda: policy(batch)) / TERA, flops(lambda: policy.sample_actions(batch)) / TERA]  # noqa: B023
+        work = (lambda: policy(batch), lambda: policy.sample_actions(batch))  # noqa: B023
+        numbers = [*map(flops, work), *(update_flops(policy, batch, frozen) for frozen in (False, True))]
         parameters = sum(p.numel() for p in policy.parameters())
-        print(f"| `{model}` | {parameters:,} | {numbers[0]:.2f} T | {numbers[1]:.2f} T |", flush=True)
+        cells = [f"{number / TERA:.2f} T" for number in numbers]
+        print(f"| `{model}` | {parameters:,} | {' | '.join(cells)} |", flush=True)
+
+
+def update_flops(policy: Any, batch: Any, freeze_vision: bool) -> int:
+    """FLOPs of the forward and the backward pass of one sample, without recomputation."""
+    apply_finetuning(policy, freeze_vision=freeze_vision)
+    with FlopCounterMode(
+        display=False, custom_mapping={torch.ops.aten.convolution_backward: _conv_gradients}
+    ) as counter:
+        policy(batch)[0].backward()
+    return counter.get_total_flops()
+
+
+def _conv_gradients(made: Any, x: Any, weight: Any, *options: Any, **_: Any) -> int:
+    """FLOPs of a convolution's gradients, from shapes. PyTorch's own count of a grouped one is for a dense one."""
+    transposed, needed = options[4], options[-1]
+    return sum(needed[:2]) * conv_flop_count(x, weight, made, transposed)
 
 
 def memory(what: str, recompute: bool, cudnn: bool) -> None:

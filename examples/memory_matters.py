@@ -57,6 +57,10 @@ OF_KIND: dict[str, dict[str, Any]] = {
     "moment": {"stride": 4},
     "gist": {"stride": 2, "anchors": 1, "recent": 1},
     "learned_topk": {"pool": LENGTH},
+    "anchors": {},
+    "events": {"stride": 1, "gripper": 0.15},
+    "pyramid": {"strides": [1, 4], "budget": 96},
+    "keyframes": {"every": 2, "pool": LENGTH // 2 + 1, "budget": 96},
     "actions": {"stride": 1, "max_steps": LENGTH, "max_video": VIDEO, "chunk": 4, "budget": 4, "grid": None},
     "spacetime": {"frames": 6, "stride": 2, "every": 1, "budget": None, "grid": None},
 }

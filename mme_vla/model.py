@@ -27,7 +27,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import AuxiliaryLosses, Backbone, Injection, KeepsKeysValues
-from mme_vla.errors import check_known, require
+from mme_vla.backbone.layers import Block
+from mme_vla.errors import UserError, check_known, require
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
 from mme_vla.types import Batch, HistoryTokens, KeysValues, MemoryTokens, Noise
@@ -183,7 +184,11 @@ class MMEModel(nn.Module):
 
     def inject(self, batch: Batch, memory: MemoryTokens | None) -> Injection:
         """The observation's blocks with memory added. The batch's images are prepared."""
-        return self.integration.inject(self.backbone.embed(batch), memory)
+        injection = self.integration.inject(self.backbone.embed(batch), memory)
+        if "positions" not in self.backbone.supports:
+            for block in injection.blocks:
+                check_uncounted(block, self.backbone)
+        return injection
 
     # Noise, device, precision
 
@@ -203,6 +208,17 @@ class MMEModel(nn.Module):
         """The autocast context of all network code."""
         kind = self.device.type if self.device.type != "meta" else "cpu"
         return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+
+def check_uncounted(block: Block, backbone: Backbone) -> None:
+    """Make sure that a block for a backbone which numbers tokens itself brings no positions."""
+    if block.positions is not None:
+        count = block.positions.shape[-1] if block.positions.ndim > 2 else 1
+        raise UserError(
+            f"The block {block.name!r} has positions of {count} number{'s'[: count > 1]} a token, and "
+            f"{type(backbone).__name__} counts tokens in causal order. Allowed here is Block.positions=None. "
+            "A backbone whose `supports` has 'positions', such as backbone=pi05, takes others."
+        )
 
 
 def masked_mean(losses: Tensor, counted: Tensor | None, weight: Tensor | None = None) -> Tensor:

@@ -95,7 +95,20 @@ MEMORIES: Registry[Any] = Registry(
         **{name: f"mme_vla.memory.{name}" for name in ("framesamp", "tokendrop", "ttt", "rmt", "joined")},
         **{
             name: f"mme_vla.memory.extensions.{name}"
-            for name in ("actions", "bank", "gist", "learned_topk", "moment", "present", "retrieval", "spacetime")
+            for name in (
+                "actions",
+                "anchors",
+                "bank",
+                "events",
+                "gist",
+                "keyframes",
+                "learned_topk",
+                "moment",
+                "present",
+                "pyramid",
+                "retrieval",
+                "spacetime",
+            )
         },
     },
 )
@@ -165,11 +178,14 @@ HISTORY_TRANSFORMS: Registry[Any] = Registry(
     "history transform",
     dict.fromkeys(("repeat_frame", "speed", "drop_frames", "noise"), "mme_vla.memory.transforms"),
 )
+EVENTS: Registry[Any] = Registry(
+    "event", dict.fromkeys(("pause", "gap", "speed", "restart"), "mme_vla.evaluation.rollout.events")
+)
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "env": ENVS, "player": PLAYERS,
     "intervention": INTERVENTIONS, "reward": REWARDS,
-    "history_transform": HISTORY_TRANSFORMS, "prompt": PROMPTS,
+    "history_transform": HISTORY_TRANSFORMS, "prompt": PROMPTS, "event": EVENTS,
 }  # fmt: skip
 
 
@@ -179,7 +195,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     Args:
         kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
             `subgoal` (a predictor), `task`, `env`, `player`, `intervention` (of a probe), `reward`,
-            `history_transform` or `prompt` (a prompt format).
+            `history_transform`, `prompt` (a prompt format) or `event` (of a rollout).
 
     >>> @register("memory", "nothing")  # doctest: +SKIP
     ... class Nothing(Memory): ...

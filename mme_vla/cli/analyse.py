@@ -5,6 +5,7 @@
     recurrence   TTT's inner losses (RMT's change of slots) along episodes
     selection    which frames and patches are remembered along an episode, as mp4 and contact sheet
     cost         FLOPs of every model at full size, or over the memory budget
+    writing      whether the frames that a memory keeps show what tasks depend on, as the simulator knows it
 
 The first three run a policy over recorded episodes: --checkpoint FOLDER, or --model NAME with fresh weights.
 """
@@ -34,6 +35,7 @@ EXAMPLES = (
     "attention --checkpoint outputs/tokendrop_expert/latest",
     "selection --memory framesamp --episode 0 --output remembered.mp4",
     "cost --models tokendrop_expert pi05",
+    "writing --memories framesamp tokendrop oracle random --tasks VideoUnmask --episodes 3",
 )
 BUDGETS = (64, 128, 256, 512, 1024)
 
@@ -200,6 +202,47 @@ def cost(args: argparse.Namespace) -> None:
     return None
 
 
+def writing(args: argparse.Namespace) -> None:
+    """Score what memories keep along demonstrations against the frames that show the facts of each task."""
+    from mme_vla.cli.inspect import build_memory
+    from mme_vla.config.composition import compose
+    from mme_vla.envs.episodes import choose_episodes
+    from mme_vla.envs.make import require_simulator
+    from mme_vla.memory.base import Memory
+    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.policy.run_folders import resolve_checkpoint
+    from mme_vla.probing.evidence import record_evidence
+    from mme_vla.probing.writing import REFERENCES, required_frames, score_writing, writing_table
+
+    require_simulator()
+    policy: MMEPolicy | None = None
+    selectors: dict[str, Memory | str] = {
+        name: name if name in REFERENCES else build_memory(compose("inspect", [f"memory={name}", *args.set]))
+        for name in args.memories
+    }
+    if args.checkpoint is not None:
+        policy = MMEPolicy.from_pretrained(resolve_checkpoint(args.checkpoint), trust_plugins=args.trust_plugins)
+        selectors[str(policy.config.get("name") or args.checkpoint.name)] = policy.require_memory()
+    required = [required_frames(memory) for memory in selectors.values() if not isinstance(memory, str)]
+    rendered = frozenset(frame for frames in required for frame in frames)
+    number = int(args.episodes) if args.episodes.isdecimal() else args.episodes
+    specs = choose_episodes(args.tasks, number, args.split)
+    episodes = [episode for spec in specs if (episode := record_evidence(spec, rendered)) is not None]
+    if len(episodes) < len(specs):
+        print(f"{len(specs) - len(episodes)} of {len(specs)} episodes are left out: the demonstrator did not succeed.")
+    trained = None if policy is None else policy.memory
+    results = {
+        name: score_writing(selector, episodes, policy if selector is trained else None)
+        for name, selector in selectors.items()
+    }
+    table = writing_table(results)
+    print(table)
+    if args.output:
+        args.output.parent.mkdir(parents=True, exist_ok=True)
+        args.output.with_suffix(".md").write_text(table, encoding="utf-8")
+    _save(args, {name: result.to_dict() for name, result in results.items()})
+
+
 @contextmanager
 def _rerun(args: argparse.Namespace) -> "Iterator[RerunLog | None]":
     """The Rerun file that was asked for, if one was."""
@@ -270,7 +313,7 @@ def _parser() -> argparse.ArgumentParser:
         made.set_defaults(run=run)
         made.add_argument("--output", type=Path, help=output)
         made.add_argument("--plugins", nargs="+", default=[], metavar="MODULE", help="your own modules, imported first")
-        if run is not cost:
+        if run not in (cost, writing):
             made.add_argument("--rerun", type=Path, help="also for the Rerun viewer, step by step (.rrd; extra viz)")
         return made
 
@@ -294,6 +337,17 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("--episode", type=int, default=0)
     made.add_argument("--every", type=int, default=8, help="steps between two images (default: %(default)s)")
     made.add_argument("--fps", type=int, default=4, help="images a second (default: %(default)s)")
+    made = command(writing, "JSON, with the tables beside it as Markdown")
+    made.add_argument(
+        "--memories", nargs="*", default=["framesamp", "oracle", "random"], metavar="NAME",
+        help="memories of configs/memory, and oracle, random, boundaries (default: %(default)s)",
+    )  # fmt: skip
+    made.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="their options, as memory.grid=2")
+    made.add_argument("--checkpoint", type=Path, help="also the memory of a trained policy")
+    made.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
+    made.add_argument("--tasks", default="all", help="all, or names with commas (default: %(default)s)")
+    made.add_argument("--episodes", default="3", help="3 for the first three, 0-9 for a range (default: %(default)s)")
+    made.add_argument("--split", default="test", help="of the benchmark (default: %(default)s)")
     made = command(cost, "CSV")
     made.add_argument("--models", nargs="+", metavar="NAME", help="default: all")
     made.add_argument("--budgets", nargs="*", type=int, help=f"memory budgets; none named: {BUDGETS}")

@@ -48,7 +48,9 @@ def cli[T](
         @functools.wraps(main)
         def job(cfg: DictConfig) -> T:
             with print_user_errors():  # here too: Hydra would print a traceback before it gets further
-                _require_values(cfg)
+                if missing := sorted(OmegaConf.missing_keys(cfg)):
+                    words = " ".join(f"{key}=…" for key in missing)
+                    raise UserError(f"A value is needed for {', '.join(missing)}: add {words}")
                 join_memories(cfg)
                 hydra_cfg = HydraConfig.get()
                 join_plugins(cfg, str(hydra_cfg.job.config_name), command_trees(), hydra_cfg.overrides.task)
@@ -98,19 +100,18 @@ def options_first(words: Sequence[str]) -> list[str]:
 def _check_command_line(config_name: str, tree: Path) -> None:
     args, unknown = get_args_parser().parse_known_intermixed_args()
     if unknown:
-        raise unknown_option(unknown[0], sys.argv[1:], known_keys(config_name, tree))
-    if (
-        len(modes := [mode for mode in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(args, mode)])
-        > 1
-    ):
+        with local_hydra(tree, []):
+            known = list(paths(OmegaConf.to_container(hydra.compose(config_name))))
+        raise unknown_option(unknown[0], sys.argv[1:], known)
+    modes = [mode for mode in ("run", "multirun", "cfg", "info", "shell_completion") if getattr(args, mode)]
+    if len(modes) > 1:
         raise UserError(f"Use one of {' and '.join(f'--{mode}'.replace('_', '-') for mode in modes)}, not both.")
+    extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     if args.help:
-        extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
         print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
-    extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
 
 
@@ -129,12 +130,6 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
             return {group: name for group, name in words.items() if not group.startswith("hydra/")}
 
     return help_page(config_name, words, trees, selected_groups)
-
-
-def known_keys(config_name: str, tree: Path) -> list[str]:
-    """Every dotted key of a command's configuration as it is by default."""
-    with local_hydra(tree, []):
-        return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
 
 
 def check_overrides(
@@ -158,12 +153,6 @@ def _choices(override: Override) -> list[str]:
         return []  # an interval has no list of values, a glob names only what exists
     left = str(override.input_line).partition("=")[0]
     return [f"{left}={value}" for value in override.sweep_string_iterator()]
-
-
-def _require_values(cfg: DictConfig) -> None:
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        raise UserError(f"A value is needed for {', '.join(missing)}: add {' '.join(f'{key}=…' for key in missing)}")
 
 
 def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:

@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import os
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +48,8 @@ def main(cfg: DictConfig) -> None:
 
 def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     """Run the episodes of one policy; `training` is the folder of its records in `output`."""
+    import torch
+
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
     from mme_vla.envs.episodes import named_tasks
@@ -57,16 +60,21 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
         choose_episodes,
         choose_shard,
         default_output,
-        evaluate,
+        evaluate_events,
         facts_of,
     )
+    from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
 
     values = resolved(cfg)
-    settings = RolloutSettings.from_config(values)
+    events = event_arms(values["event"])
+    settings = RolloutSettings.from_config({**values, "event": None})
     if values["deterministic"]:
         settings = replace(settings, max_batch=1)
-        repeat_exactly()
+        # PyTorch takes kernels whose results repeat; where an operation has none, it warns.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        torch.backends.cudnn.benchmark = False
     jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
     shard = choose_shard(values["shard"])
     environment(settings.env).check_installed()
@@ -87,10 +95,11 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
     notes["deterministic"] = values["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
-    _use_spawn()
+    if multiprocessing.get_start_method() == "loky":  # a job of joblib: a worker of ours cannot look that way up
+        multiprocessing.set_start_method("spawn", force=True)
     try:
-        done = evaluate(
-            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings,
+        done = evaluate_events(
+            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings, events,
             subgoals=subgoals, shard=shard, source=source, notes=notes,
             times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
         )  # fmt: skip
@@ -99,15 +108,6 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
             report_usage(subgoals.usage)
             subgoals.close()
     report(done, output)
-
-
-def repeat_exactly() -> None:
-    """Have PyTorch choose kernels whose results repeat; where an operation has none, it warns."""
-    import torch
-
-    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
-    torch.use_deterministic_algorithms(True, warn_only=True)
-    torch.backends.cudnn.benchmark = False
 
 
 def choose_device(name: str) -> "torch.device":
@@ -168,7 +168,9 @@ def report(done: "Evaluation", output: Path) -> None:
         table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %", *cells)
     # Piped into a file there is no terminal to fit: as wide as the table is.
     console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
-    if rows:
+    if done.matched:
+        report_events(done, console.width)
+    elif rows:
         console.print(table)
     work = done.workload
     if work.batches:
@@ -179,6 +181,16 @@ def report(done: "Evaluation", output: Path) -> None:
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
     logger.info("python -m mme_vla.results %s", output)
+
+
+def report_events(done: "Evaluation", width: int) -> None:
+    """Say what events changed, and where one did not act."""
+    from mme_vla.evaluation.results.events import did_not_act, event_table
+    from mme_vla.evaluation.results.tables import print_table
+
+    print_table(event_table([*done.records, *done.matched], "first"), width)
+    for event, count in Counter(event for record in done.records for event in did_not_act(record)).items():
+        logger.warning("event=%s did not act in %d episodes: its place never came", event, count)
 
 
 def report_usage(usage: "Usage") -> None:
@@ -192,9 +204,3 @@ def report_usage(usage: "Usage") -> None:
     words += [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
     if words:
         logger.info("subgoals: %s", ", ".join(words))
-
-
-def _use_spawn() -> None:
-    """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
-    if multiprocessing.get_start_method() == "loky":
-        multiprocessing.set_start_method("spawn", force=True)

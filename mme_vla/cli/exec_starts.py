@@ -1,13 +1,76 @@
-"""`mme-vla exec-starts`: where the conditioning videos of a dataset end, as a side file."""
+"""`mme-vla exec-starts`: where the conditioning videos of a dataset end, as a side file made from recordings that tell.
 
+`lerobot/robomme` has neither `is_demo` nor `exec_start_idx`. Its episodes are those of the official HDF5 files, so each
+is found among them by its goal, its length and its joint angles.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
-from mme_vla.data.exec_starts import annotated_episodes, first_frames
-from mme_vla.errors import require
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.embodiment.robomme import ARM_JOINTS
+from mme_vla.errors import listed, require
 from mme_vla.utils import write_json
+
+NEAR = 0.05  # radians on average: a demonstration that was made anew differs a little, another episode by far more
+_UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
+
+
+@dataclass(frozen=True)
+class AnnotatedEpisode:
+    """A recorded episode that says where its video ends.
+
+    goals: its wordings, lower-case. joints: [t, 7] radians. start: the first execution frame.
+    """
+
+    goals: tuple[str, ...]
+    joints: np.ndarray
+    start: int
+
+
+def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
+    """All episodes, in order, of official HDF5 files or their folders, and of LeRobot datasets that mark the video."""
+    episodes: list[AnnotatedEpisode] = []
+    for path in inputs:
+        if (Path(path) / "meta").is_dir():
+            source = EpisodeSource(path)
+            for e, start in enumerate(source.exec_starts.tolist()):
+                episodes.append(AnnotatedEpisode((source.goal(e),), source.states(e)[:, :ARM_JOINTS], start))
+            continue
+        for ref in list_episodes(find_files([path])):
+            with open_episode(ref) as episode:
+                joints = episode.joints()[0].astype(np.float32)
+                episodes.append(AnnotatedEpisode(tuple(episode.goals), joints, episode.exec_start))
+    return episodes
+
+
+def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> list[int]:
+    """The first execution frame of every episode of a dataset that does not mark its videos."""
+    source = EpisodeSource(dataset, robot=_UNMARKED)
+    matches = []
+    for episode in range(len(source)):
+        goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
+        alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
+        apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
+        nearest = min(apart, default=np.inf)
+        starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
+        near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
+        place = f"{source.root}, episode {episode}"
+        require(
+            nearest <= NEAR,
+            f"{place} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} episodes given: {near}. Give "
+            "the recordings that the dataset was made from, all of them.",
+        )
+        require(len(starts) <= 1, f"{place}: recordings that fit alike begin at {listed(starts)}.")
+        matches.append(starts[0])
+    return matches
 
 
 @cli("exec_starts")

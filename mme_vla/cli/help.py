@@ -151,7 +151,15 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], sel
         if word not in groups:
             raise UserError(f"{word!r} is no group of this command. {did_you_mean(word, groups)}")
     if named:
-        return "\n".join(line for group in named for line in _group(group, groups[group], trees))
+        return "\n".join(
+            line
+            for group in named
+            for lines in (
+                [f"Group {group}, by default {group}={groups[group]}", ""],
+                *(_file(group, name, trees) for name in choices(trees, group)),
+            )
+            for line in lines
+        )
     command = COMMANDS.get(config_name, f"python {Path(sys.argv[0]).name}")
     examples, text = heading(file)
     lines = [f"Usage: {command} [KEY=VALUE | GROUP=NAME] …", "", *_wrapped(text), ""]
@@ -187,13 +195,6 @@ def _group_pages(groups: dict[str, str], requested: set[str], trees: Sequence[Pa
     displayed = {"model", "memory", "integration"} if "model" in requested else set()
     for group in sorted((requested | displayed) & groups.keys()):
         lines += _file(group, groups[group], trees)
-    return lines
-
-
-def _group(group: str, current: str, trees: Sequence[Path]) -> list[str]:
-    lines = [f"Group {group}, by default {group}={current}", ""]
-    for name in choices(trees, group):
-        lines += _file(group, name, trees)
     return lines
 
 

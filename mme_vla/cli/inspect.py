@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.memory.base import Memory
-    from mme_vla.policy.base import Policy
 
 
 @cli("inspect")
@@ -59,7 +58,10 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     folder = resolve_checkpoint(folder)
     policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
     table = _table(str(folder), "part", "tensors", "parameters", "dtype")
-    for part, tensors in _parts(policy).items():
+    parts: dict[str, list[Any]] = {}
+    for name, parameter in policy.named_parameters():
+        parts.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
+    for part, tensors in parts.items():
         dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
         table.add_row(part, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
     total = list(policy.parameters())
@@ -166,13 +168,18 @@ def draw_memory(
     source: "EpisodeSource", episode: int, step: int, memory: "Memory", name: str, folder: Path, console: "Console"
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
+    import torch
+
     from mme_vla.data.memory_image import memory_sheet
+    from mme_vla.data.statistics import normalised_states
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
     history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
     stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
-    history.append(frames, _no_tokens(len(stored), patches))
+    history.append(frames, torch.zeros(len(stored), patches, 1))  # selections do not read tokens
+    motion = normalised_states(source.states(episode, 0, step + 1))
+    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
     selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")
@@ -186,20 +193,6 @@ def draw_memory(
     start = int(source.exec_starts[episode])
     memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path
-
-
-def _no_tokens(frames: int, patches: int) -> Any:
-    import torch
-
-    return torch.zeros(frames, patches, 1)  # selections do not read tokens
-
-
-def _parts(policy: "Policy") -> dict[str, list[Any]]:
-    """Parameters by the parts of fine-tuning, in the policy's order."""
-    groups: dict[str, list[Any]] = {}
-    for name, parameter in policy.named_parameters():
-        groups.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
-    return groups
 
 
 def _table(title: str, *columns: str) -> "Table":

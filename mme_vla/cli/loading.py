@@ -16,17 +16,9 @@ if TYPE_CHECKING:
 
 # What a checkpoint brings along, so that it cannot be set beside one.
 _MODEL_KEYS = (
-    "name",
-    "model",
-    "embodiment",
-    "backbone",
-    "memory",
-    "integration",
-    "policy",
-    "processor",
-    "subgoal_text",
+    "name", "model", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
     "token_budget",
-)
+)  # fmt: skip
 
 
 class LoadedPolicy(NamedTuple):

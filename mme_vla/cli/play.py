@@ -39,7 +39,8 @@ def main(cfg: DictConfig) -> None:
     """Play the episodes that are not played yet, on the page or by a model, and compare with the paper."""
     from mme_vla.envs.rendering import render_backend
     from mme_vla.play import build_player
-    from mme_vla.play.web import require_page
+    from mme_vla.play.desk import Desk
+    from mme_vla.play.web import require_page, serve
 
     config = resolved(cfg)
     log_to_terminal(log, clock=True)
@@ -65,22 +66,16 @@ def main(cfg: DictConfig) -> None:
     try:
         with PlayRun(folder, specs, identity, make, config["retry_errors"]) as run:
             if built is None:
-                _on_the_page(run, str(who), str(config["host"]), config["port"])
+                serve(Desk(run, str(who)), str(config["host"]), config["port"])
+                played = len(run.episodes) - len(run.todo)
+                of = f"{played} of {len(run.episodes)} episodes played"
+                log.info("ended · %s; the same command continues with the others", of)
             else:
                 _by_itself(run, built)
             print_summary(run)
     finally:
         if built is not None:
             built.close()
-
-
-def _on_the_page(run: PlayRun, participant: str, host: str, port: int) -> None:
-    from mme_vla.play.desk import Desk
-    from mme_vla.play.web import serve
-
-    serve(Desk(run, participant), host, port)
-    played = len(run.episodes) - len(run.todo)
-    log.info("ended · %d of %d episodes played; the same command continues with the others", played, len(run.episodes))
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:
@@ -108,14 +103,10 @@ def _play_one(run: PlayRun, which: EpisodeId, player: Any) -> EpisodeRecord:
         return run.save_error(which, f"{type(error).__name__}: {error}", session, **notes)
     finally:
         if session is not None:
-            _close(session)
-
-
-def _close(session: ChoiceSession) -> None:
-    try:
-        session.close()
-    except Exception:  # after a crash there may be nothing left to close
-        log.warning("the simulator could not be closed", exc_info=True)
+            try:
+                session.close()
+            except Exception:  # after a crash there may be nothing left to close
+                log.warning("the simulator could not be closed", exc_info=True)
 
 
 def line(record: EpisodeRecord) -> str:

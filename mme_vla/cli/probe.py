@@ -2,7 +2,6 @@
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig
 
@@ -10,14 +9,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
-from mme_vla.errors import UserError
-
-if TYPE_CHECKING:
-    from mme_vla.envs.vector.pool import Job
-    from mme_vla.evaluation.recordings import Recording
-    from mme_vla.evaluation.rollout.settings import RolloutSettings
-    from mme_vla.policy.base import Policy
-
+from mme_vla.errors import UserError, require
 
 logger = logging.getLogger("mme_vla.probe")
 
@@ -25,39 +17,51 @@ logger = logging.getLogger("mme_vla.probe")
 @cli("probe")
 def main(cfg: DictConfig) -> None:
     """Probe what has no result yet, and write the page."""
+    from mme_vla.data.sources import open_sources
     from mme_vla.envs.base import environment
-    from mme_vla.evaluation.rollout.evaluation import choose_shard, facts_of
+    from mme_vla.envs.episodes import choose_numbers, named_tasks
+    from mme_vla.evaluation.recordings import all_recordings
+    from mme_vla.evaluation.rollout.evaluation import choose_episodes, choose_shard, facts_of
+    from mme_vla.evaluation.rollout.events import event_arms
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.probing.offline import OfflineSettings
-    from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
+    from mme_vla.probing.report import table_of
+    from mme_vla.probing.run import IN_CLOSED_LOOP, NO_DATA, ProbePlan, probed_folder, run_probe
     from mme_vla.utils import safe_name
 
     values = resolved(cfg)
-    if values["compare"] is not None:
-        print(_table(values["compare"]))
+    if (folders := values["compare"]) is not None:
+        listed = [folders] if isinstance(folders, str) else list(folders)
+        print(table_of({folder: probed_folder(Path(folder)) for folder in listed}))
         return
     if not (values["offline"] or values["online"]):
         raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
     if values["offline"] and values["recordings"] is None:
         raise UserError(NO_DATA)
-    settings = RolloutSettings.from_config(values)
+    events = event_arms(values["event"])
+    require(values["online"] or not events, IN_CLOSED_LOOP)
+    settings = RolloutSettings.from_config({**values, "event": None})
     offline = OfflineSettings.from_config(values)
-    jobs = _jobs(values, settings) if values["online"] else []
+    jobs = []
+    if values["online"]:
+        jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
     shard = choose_shard(values["shard"])
     if jobs:
         environment(settings.env).check_installed()
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
-    recordings = _recordings(values["recordings"], policy)
-    probed = _select(recordings, values["recorded"]) if values["offline"] else []
+    data = values["recordings"]
+    recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))
+    numbers = choose_numbers(values["recorded"], len(recordings), "the data") if values["offline"] else []
+    probed = [recordings[i] for i in numbers]
     subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device) if jobs else None
     predictor = None if subgoals is None else str(values["subgoal"]["name"])
     facts = facts_of(policy, name, source, settings, predictor)
     folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source, events)
     try:
         report = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals)
     finally:
@@ -66,33 +70,3 @@ def main(cfg: DictConfig) -> None:
             subgoals.close()
     print((report.page.parent / "table.md").read_text(encoding="utf-8"))
     print(report.page)
-
-
-def _jobs(values: dict[str, Any], settings: "RolloutSettings") -> "list[Job]":
-    """The episodes of the closed loop."""
-    from mme_vla.envs.episodes import named_tasks
-    from mme_vla.evaluation.rollout.evaluation import choose_episodes
-
-    return choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
-
-
-def _recordings(data: Any, policy: "Policy") -> "list[Recording]":
-    from mme_vla.data.sources import open_sources
-    from mme_vla.evaluation.recordings import all_recordings
-
-    return [] if data is None else all_recordings(open_sources(data, policy.embodiment))
-
-
-def _select(recordings: "list[Recording]", which: Any) -> "list[Recording]":
-    """The recorded episodes that are probed, by the grammar of all commands."""
-    from mme_vla.envs.episodes import choose_numbers
-
-    return [recordings[i] for i in choose_numbers(which, len(recordings), "the data")]
-
-
-def _table(folders: Any) -> str:
-    from mme_vla.probing.report import table_of
-    from mme_vla.probing.run import probed_folder
-
-    listed = [folders] if isinstance(folders, str) else list(folders)
-    return table_of({folder: probed_folder(Path(folder)) for folder in listed})

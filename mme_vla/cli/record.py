@@ -18,6 +18,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
+from mme_vla.envs.recording.own import record_own
 from mme_vla.envs.rows import task_options
 from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError, require
@@ -181,7 +182,11 @@ def plan(cfg: "DictConfig") -> list[Job]:
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    frames = _frame_choice(cfg)
+    values: Any = OmegaConf.to_container(cfg)
+    at, memory = (values[key] for key in KEYS)
+    beside = "frames=all draws every frame, those of a memory too: leave out memory, or set frames."
+    require(at != "all" or memory is None, beside)
+    frames = None if at == "all" else FrameChoice(at, memory)
     return [
         Job(
             s.task,
@@ -195,16 +200,6 @@ def plan(cfg: "DictConfig") -> list[Job]:
         )
         for s in specs
     ]
-
-
-def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
-    frames: Any
-    memory: Any
-    frames, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
-    if frames == "all":
-        require(memory is None, "frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
-        return None
-    return FrameChoice(frames, memory)
 
 
 def run(cfg: "DictConfig") -> None:
@@ -224,7 +219,7 @@ def run(cfg: "DictConfig") -> None:
         jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5)
     )
     places = ", ".join(map(str, recording_plan.places))
-    work = Path(cfg.output).with_name(Path(cfg.output).name + ".recording")
+    work = _work_folder(cfg.output)
     if not recording_plan.missing(options) and not work.exists():
         print(f"{places}: {len(jobs)} episodes, all there already.")
         if cfg.coverage is not None:
@@ -233,7 +228,7 @@ def run(cfg: "DictConfig") -> None:
         return
     require_simulator()
     with FolderLock(work, "recording"):
-        _claim(work, jobs)
+        _claim(work, [job.plan for job in jobs])
         missing = recording_plan.missing(options)  # asked again: another process may have finished it meanwhile
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
@@ -255,12 +250,15 @@ def run(cfg: "DictConfig") -> None:
 
 def record_environment(cfg: "DictConfig") -> None:
     """Record demonstrations of an environment of the user's own."""
-    from mme_vla.envs.recording.own import record_own
-
     source = environment(cfg.env)
     source.check_installed()
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split, cfg.env)
-    frames, failures = record_own(source, specs, Path(cfg.output), cfg.fps)
+    output, work = Path(cfg.output), _work_folder(cfg.output)
+    require(not output.exists(), f"{output} exists already; choose another output, or remove it yourself.")
+    with FolderLock(work, "recording"):
+        _claim(work, [{"env": cfg.env, "fps": cfg.fps}, *map(vars, specs)])
+        frames, failures = record_own(source, specs, output, work, cfg.fps)
+        drop_plan(work)
     print(f"{cfg.output}: {len(specs) - len(failures)} episodes, {frames} steps; {len(failures)} did not succeed.")
 
 
@@ -274,10 +272,14 @@ def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
     )
 
 
-def _claim(work: Path, jobs: Sequence[Job]) -> None:
+def _work_folder(output: str) -> Path:
+    return Path(output).with_name(Path(output).name + ".recording")
+
+
+def _claim(work: Path, plan: list[dict[str, Any]]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
     require(
-        claim_plan(work, [job.plan for job in jobs]),
+        claim_plan(work, plan),
         f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
         "another output, or remove that folder yourself.",
     )

@@ -16,6 +16,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.curves import process_tables, stress_curves, stress_figures, stress_table
+from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import read_runs, training_details
 from mme_vla.evaluation.results.scopes import TASK_FACTS, TEST_EPISODES, Protocol, tasks_of
@@ -69,6 +70,9 @@ def run(args: argparse.Namespace) -> None:
         curves = stress_curves(records, args.confidence, args.conflicts)
         show_tables([stress_table(curves)], stress_figures(curves), "Episodes that every place of the dial has.", args)
         return
+    if args.events:
+        show_events(records, args)
+        return
     if args.ood:
         show_ood(records, args)
         return
@@ -97,6 +101,14 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     known = {**FURTHER_SPLITS, HARD: HARD_EPISODES}
     counts = {known.get(str(name), TEST_EPISODES) for name in splits}
     return counts.pop() if len(counts) == 1 else TEST_EPISODES
+
+
+def show_events(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
+    """Print runs with events beside their matched arms, and success over length; write both where a file is named."""
+    curves = event_curves(records, args.confidence, args.conflicts)
+    tables = [event_table(records, args.conflicts), stress_table(curves, "Success over the length of events")]
+    figures = stress_figures(curves, "control steps, frames or factor")
+    show_tables([table for table in tables if table.rows], figures, "Episodes that every length has.", args)
 
 
 def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
@@ -165,9 +177,11 @@ def _tables(results: Results, comparisons: list[Comparison], detailed: bool = Tr
 
 
 def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[tuple[Method, Method]]:
-    """The pairs asked for; unasked, two methods alone where they share episodes, and otherwise a note."""
+    """The pairs asked for; unasked, events and their matched arms, or two methods alone that share episodes."""
     if requested is not None:
         return [(results.method(first), results.method(second)) for first, second in requested]
+    if pairs := matched_methods(results):
+        return [pair for pair in pairs if common_episodes(*pair)]
     if len(results.methods) != 2:
         return []
     first, second = results.methods
@@ -187,6 +201,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--html", type=Path, help="one self-contained page with plots")
     parser.add_argument("--title", default="RoboMME results", help="of the page")
     parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
+    parser.add_argument("--events", action="store_true", help="runs with event=… beside their matched arms instead")
     parser.add_argument("--ood", action="store_true",
                         help="RoboMME-OOD by tier beside published figures, twins, extrapolation")  # fmt: skip
     parser.add_argument("--brief", action="store_true", help="print the overview only")

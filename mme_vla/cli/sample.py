@@ -1,15 +1,69 @@
-"""`mme-vla sample FULL_FOLDER THINNED_FOLDER`: make the dataset that the package ships."""
+"""`mme-vla sample FULL_FOLDER THINNED_FOLDER`: make the dataset that the package ships, `mme_vla/assets/sample`.
+
+Four real demonstrations, one of them with an image for every step, as a LeRobot v3.0 dataset of under 6 MB. It exists
+so that the first command of the README needs nothing else; users need not run this.
+"""
 
 import argparse
+import shutil
 from pathlib import Path
 
+from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.hdf5 import EpisodeRef
 from mme_vla.data.lerobot_files import SAMPLE
-from mme_vla.data.sample import make_sample
+from mme_vla.errors import UserError, require
+
+# (folder, task, episode): `full` holds one episode with an image a step, `thinned` the others.
+EPISODES = (
+    ("full", "VideoUnmask", 6),
+    ("thinned", "PatternLock", 8),
+    ("thinned", "PickXtimes", 8),
+    ("thinned", "VideoUnmask", 4),
+)
+# Lossless luminance, halved colour resolution and few key frames: smaller than lossy video with frequent key frames,
+# and a patch in which nothing moves stays exactly the same.
+OPTIONS = ConvertOptions(pix_fmt="yuv420p", gop=32)
+LIMIT = 6_000_000
+
+README = """# The embedded sample
+
+Four RoboMME demonstrations (LeRobot v3.0, 916 frames at the simulator's 20 Hz, videos), written by the official
+recorder with a software rasteriser and converted by `mme-vla sample`.
+
+| episode | task | difficulty | seed | frames | of them video | front image | wrist image |
+| --- | --- | --- | --- | --- | --- | --- | --- |
+| 0 | VideoUnmask 6 | medium | 6600 | 173 | 66 | every step | every 6th step |
+| 1 | PatternLock 8 | easy | 15800 | 148 | 74 | every 4th step | every 4th step |
+| 2 | PickXtimes 8 | easy | 1800 | 332 | 0 | every 30th step | every 30th step |
+| 3 | VideoUnmask 4 | easy | 6400 | 263 | 66 | every 8th step | every 8th step |
+
+**Stale images.** To keep the sample small, images are stored only at every n-th step (n in the table), at sub-task
+boundaries, at the first and last frame, and where the conditioning video ends. Every other step repeats the last stored
+image, which is up to n - 1 steps old. States, actions, subgoals and flags are those of every step. So only episode 0
+shows motion as it was; use it where motion matters. Results on this sample say nothing about the benchmark.
+
+`configs/data/sample.yaml` holds out episode 3 for validation: another scene of the task of episode 0.
+"""
+
+
+def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
+    """Write the sample and return its size in bytes."""
+    folders = {"full": full, "thinned": thinned}
+    refs = [EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task) for kind, task, number in EPISODES]
+    for ref in refs:
+        require(ref.file.is_file(), f"{ref.file} does not exist; the sample needs {ref.group} of it.")
+    convert(refs, output, OPTIONS)
+    (output / "README.md").write_text(README)
+    size = sum(file.stat().st_size for file in output.rglob("*") if file.is_file())
+    if size > LIMIT:
+        shutil.rmtree(output)
+        raise UserError(f"The sample would take {size / 1e6:.1f} MB; the limit is {LIMIT / 1e6:.0f} MB.")
+    return size
 
 
 def main() -> None:
     """Run `mme-vla sample`."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
     parser.add_argument("full", type=Path, help="folder with the VideoUnmask file that has an image for every step")
     parser.add_argument("thinned", type=Path, help="folder with the thinned files")
     parser.add_argument("--output", type=Path, default=SAMPLE, help="new dataset folder (default: inside the package)")

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -42,12 +42,11 @@ def several_memories(overrides: Iterable[str]) -> list[str]:
 
     Hydra itself would lay the two files over each other.
     """
-
-    def expand_word(word: str) -> Iterator[str]:
+    result: list[str] = []
+    for word in overrides:
         several = _SEVERAL.fullmatch(word)
-        yield from [f"memory={JOINED}", f"memory.members={several[1]}"] if several else [word]
-
-    return [new for word in overrides for new in expand_word(word)]
+        result += [f"memory={JOINED}", f"memory.members={several[1]}"] if several else [word]
+    return result
 
 
 def join_memories(cfg: DictConfig) -> DictConfig:

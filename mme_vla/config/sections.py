@@ -7,7 +7,7 @@ Annotations declare all of it: `port: Annotated[int, Range(0, 65535)]`, `kind: L
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from functools import cache
+from functools import cache, partial
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
@@ -76,9 +76,7 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
     return kind(**read, **fixed)
 
 
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return get_type_hints(kind, include_extras=True)
+_hints = cache(partial(get_type_hints, include_extras=True))
 
 
 def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:

@@ -13,10 +13,14 @@ from mme_vla.errors import UserError, check_known, listed, require
 
 BOUNDARY = "subtask_boundary"
 """The label that is 1 at the first frame of every sub-task and 0 elsewhere, from the column `simple_subgoal`."""
+SUBTASK = "subtask_index"
+"""The label that counts the sub-tasks that have begun in an episode so far, from 1."""
 
 
 def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
-    """A label of every frame of a dataset, [rows] or [rows, k] float32: a column of numbers, or `subtask_boundary`.
+    """A label of every frame of a dataset, [rows] or [rows, k] float32.
+
+    A column of numbers, `subtask_boundary`, or `subtask_index`.
 
     Args:
         key: what names the column, for messages (`data.weights`).
@@ -26,6 +30,9 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
     """
     if name == BOUNDARY:
         return _boundaries(source)
+    if name == SUBTASK:
+        begun, first = np.cumsum(_boundaries(source)), np.cumsum(source.lengths) - source.lengths
+        return (begun - np.repeat(begun[first] - 1, source.lengths)).astype(np.float32)
     column = _read(source, name, key)
     values = column.combine_chunks()
     nested = pa.types.is_list(values.type) or pa.types.is_large_list(values.type)

@@ -46,7 +46,7 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    if not console.is_terminal:
+    if not (console.is_terminal and console.file.isatty()):  # FORCE_COLOR makes the first true, in notebooks too
         begun = reported = time.monotonic()
         count = done
 

@@ -99,9 +99,7 @@ class EpisodeSource:
         episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
         self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
         self._goals = list(episodes["goals"])
-        self._videos = {
-            name: _VideoFiles(self.root, info.get("video_path"), column, episodes) for name, column in videos.items()
-        }
+        self._episodes, self._video_path = episodes, info.get("video_path")
         self._table = open_table(self.root, columns, features)
         self._reader = VideoReader(max_open_videos)
         self._check_rows()
@@ -286,13 +284,14 @@ class EpisodeSource:
                 f"{indices[~rendered].tolist()[:5]}. "
                 "It was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
             )
-        if camera in self._videos:
-            path, offset = self._videos[camera].locate(episode)
+        column, start = self.columns[camera], int(self._starts[episode])
+        if camera in self.video_cameras:
+            chunk, file = (int(self._episodes[f"{column}/{key}"][episode]) for key in ("chunk_index", "file_index"))
+            path = video_file(self.root, self._video_path, column, chunk, file)
+            offset = float(self._episodes[f"{column}/from_timestamp"][episode])
             return self._reader.read(path, offset + indices / self.fps, self.fps)
         from PIL import Image
 
-        start = int(self._starts[episode])
-        column = self.columns[camera]
         cells = [self._table[start + int(i) : start + int(i) + 1][column][0].as_py() for i in indices]
         with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
             return np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB")) for cell in cells])
@@ -356,19 +355,6 @@ class EpisodeSource:
 
     def _column(self, name: str) -> np.ndarray:
         return _flat(self._table.select_columns(name)[:][name]).to_numpy(zero_copy_only=False)
-
-
-class _VideoFiles:
-    """Which file, and from which second on, holds an episode's images of one view."""
-
-    def __init__(self, root: Path, template: object, view: str, episodes: dict[str, Any]) -> None:
-        self._root, self._template, self._view = root, template, view
-        self._files = np.stack([episodes[f"{view}/{key}"] for key in ("chunk_index", "file_index")], axis=1)
-        self._offsets = episodes[f"{view}/from_timestamp"]
-
-    def locate(self, episode: int) -> tuple[Path, float]:
-        chunk, file = (int(x) for x in self._files[episode])
-        return video_file(self._root, self._template, self._view, chunk, file), float(self._offsets[episode])
 
 
 def _flat(column: Any) -> Any:

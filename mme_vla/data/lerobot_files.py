@@ -5,7 +5,7 @@ LeRobot's own reader is not used: it downloads a file from the hub that it canno
 
 import math
 import string
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from hashlib import sha256
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.hdf5 import SUBGOALS
-from mme_vla.embodiment import Camera, Embodiment
+from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
@@ -53,15 +53,21 @@ class Columns:
 
 def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: Embodiment) -> Columns:
     """Match a robot with a dataset."""
-    matches = {
-        **{camera.name: _first(_spellings_of(camera), features) for camera in robot.cameras},
-        **{key: _first((key, f"observation.{key}"), features) for key in (*robot.state.key, *robot.action.pose_key)},
-        **{key: _first((key, *(_ACTION if key in _ACTION else ())), features) for key in robot.action.key},
+    spellings = {
+        camera.name: [
+            spelling
+            for name in ((camera.key, camera.name) if camera.key else (camera.name,))
+            for spelling in (name, f"observation.images.{name}")
+        ]
+        for camera in robot.cameras
     }
+    spellings |= {key: [key, f"observation.{key}"] for key in (*robot.state.key, *robot.action.pose_key)}
+    spellings |= {key: [key, *(_ACTION if key in _ACTION else ())] for key in robot.action.key}
     if not robot.state.key:
-        matches["state"] = _first(("observation.state", "state"), features)
+        spellings["state"] = ["observation.state", "state"]
     if not robot.action.key:
-        matches["action"] = _first(_ACTION, features)
+        spellings["action"] = [*_ACTION]
+    matches = {key: next((name for name in names if name in features), None) for key, names in spellings.items()}
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
     missing = [keys.get(name, name) for name, column in matches.items() if column is None]
     require(
@@ -81,11 +87,12 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
         )
     state = tuple(columns[key] for key in robot.state.key or ("state",))
     action = tuple(columns[key] for key in robot.action.key or ("action",))
-    _check_width(root, "state", state, features, robot.state.width, robot)
-    _check_width(root, "action", action, features, robot.action.width, robot)
     pose = tuple(columns[key] for key in robot.action.pose_key)
-    if pose:
-        _check_width(root, "tool's pose", pose, features, POSE_WIDTH, robot)
+    vectors = {"state": (state, robot.state.width), "action": (action, robot.action.width)}
+    for what, (names, width) in (vectors | ({"tool's pose": (pose, POSE_WIDTH)} if pose else {})).items():
+        if sum(width_of(features[name]) for name in names) != width:
+            shapes = ", ".join(f"{name} has shape {list(features[name]['shape'])}" for name in names)
+            raise UserError(f"{root}: {shapes}; expected [{width}], the {what} of the robot {robot.name!r}.")
     tables = ["episode_index", *state, *action, *pose, *(name for name in OPTIONAL if name in features)]
     tables += [f"{name}{RENDERED_SUFFIX}" for name in cameras if f"{name}{RENDERED_SUFFIX}" in features]
     tables += [column for column in cameras.values() if features[column]["dtype"] == "image"]
@@ -112,28 +119,6 @@ def names_of(features: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
             return ()
         names += map(str, listed)
     return tuple(names)
-
-
-def _spellings_of(camera: Camera) -> list[str]:
-    names = [camera.key, camera.name] if camera.key else [camera.name]
-    return [spelling for name in names for spelling in (name, f"observation.images.{name}")]
-
-
-def _first(names: Iterable[str], features: Mapping[str, Any]) -> str | None:
-    return next((name for name in names if name in features), None)
-
-
-def _check_width(
-    root: Path,
-    what: str,
-    columns: Sequence[str],
-    features: Mapping[str, Mapping[str, Any]],
-    width: int,
-    robot: Embodiment,
-) -> None:
-    if sum(width_of(features[name]) for name in columns) != width:
-        shapes = ", ".join(f"{name} has shape {list(features[name]['shape'])}" for name in columns)
-        raise UserError(f"{root}: {shapes}; expected [{width}], the {what} of the robot {robot.name!r}.")
 
 
 SAMPLE = Path(__file__).resolve().parent.parent / "assets" / "sample"

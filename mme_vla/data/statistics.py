@@ -4,12 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import require
-from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats
+from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats, normalize
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 
@@ -72,3 +73,10 @@ def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarr
             step = np.asarray(every, np.int32)
             parts.append(np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1))
     return np.concatenate(parts)
+
+
+def normalised_states(states: np.ndarray) -> Tensor:
+    """States [t, s] by their own quantiles, [t, s] float32: of recordings that no policy with statistics reads."""
+    low, high = np.quantile(states.astype(np.float64), (0.01, 0.99), axis=0)
+    stats = QuantileStats(states.mean(0), states.std(0), low, high)
+    return normalize(torch.from_numpy(np.asarray(states, np.float32)), stats)

@@ -51,8 +51,7 @@ def find_motions(rows: np.ndarray, first: int) -> Motions:
     new[1:] = (targets[1:] != targets[:-1]).any(1)
     begun = noted[new]
     decisions = np.maximum(begun - 1, np.arange(len(begun)))
-    if len(decisions):
-        decisions[0] = 0
+    decisions[:1] = 0
     return Motions(decisions.astype(np.int64) + first, targets[new].astype(np.float32))
 
 

@@ -10,32 +10,15 @@ if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import Job, Reply, VecEnv, make_vec_env
 
 __all__ = [
-    "TASK_NAMES",
-    "EpisodeSpec",
-    "Job",
-    "Reply",
-    "RoboMMEEnv",
-    "VecEnv",
-    "episode",
-    "episodes",
-    "load_tasks",
-    "make_env",
-    "make_vec_env",
-]
+    "TASK_NAMES", "EpisodeSpec", "Job", "Reply", "RoboMMEEnv", "VecEnv", "episode", "episodes", "load_tasks",
+    "make_env", "make_vec_env",
+]  # fmt: skip
 
 _HOMES = {
-    "EpisodeSpec": "metadata",
-    "Job": "vector.pool",
-    "Reply": "vector.pool",
-    "RoboMMEEnv": "interface",
-    "TASK_NAMES": "metadata",
-    "VecEnv": "vector.pool",
-    "episode": "metadata",
-    "episodes": "metadata",
-    "load_tasks": "make",
-    "make_env": "make",
-    "make_vec_env": "vector.pool",
-}
+    "EpisodeSpec": "metadata", "Job": "vector.pool", "Reply": "vector.pool", "RoboMMEEnv": "interface",
+    "TASK_NAMES": "metadata", "VecEnv": "vector.pool", "episode": "metadata", "episodes": "metadata",
+    "load_tasks": "make", "make_env": "make", "make_vec_env": "vector.pool",
+}  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

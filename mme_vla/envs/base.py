@@ -8,6 +8,7 @@ become the conditioning video), `success` (bool) and `subgoal` (text).
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,6 +25,13 @@ CHOICES = "multi_choice"
 _FIRST_SEED = {"train": 0, "test": 500_000, "val": 1_000_000}
 _OTHER_SPLITS = 2_000_000  # first seed of splits with other names
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
+
+
+@dataclass(frozen=True)
+class Hold:
+    """An action of every action space: the robot stays where it is for so many control steps, and the limit grows."""
+
+    steps: int
 
 
 class Environment(ABC):
@@ -57,6 +65,14 @@ class Environment(ABC):
         )
         yield from ()
 
+    def hold(self, env: Any) -> Any:
+        """The action that keeps the robot where it is, for events in which it pauses.
+
+        Raises:
+            UserError: the environment has none.
+        """
+        require(False, f"{type(self).__name__} cannot pause: implement hold(env), the action that keeps the robot.")
+
     def choices(self, env: Any) -> Mapping[str, Actions]:
         """What can be chosen in `play` now: text → the actions that carry it out. Empty: nothing."""
         return {}
@@ -80,6 +96,11 @@ class Environment(ABC):
 
     def check_installed(self) -> None:  # noqa: B027
         """Make sure that packages which the environment needs are installed."""
+
+    def check_hold(self) -> None:
+        """Make sure that the robot can hold its pose."""
+        if type(self).hold is Environment.hold:
+            self.hold(None)
 
     def check_embodiment(self, robot: Embodiment) -> None:
         """Make sure that a policy with this robot can be evaluated here."""
@@ -149,25 +170,30 @@ class EpisodeEnv:
     ) -> None:
         self.environment, self.env, self.spec = environment, env, spec
         self.max_steps, self._by_choice = max_steps, by_choice
-        self._goal, self._steps = "", 0
+        self.goal, self._steps, self._limit = "", 0, max_steps
         self._choices: dict[str, Actions] = {}
 
     def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
         """The conditioning video, if there is one, and the current frame."""
         observation, info = self.env.reset(seed=self.spec.seed)
         require(isinstance(info.get("goal"), str), f"{self.spec.task}: reset() must return the goal in info['goal'].")
-        self._goal, self._steps = info["goal"], 0
+        self.goal, self._steps, self._limit = info["goal"], 0, self.max_steps
         return self._lists([*info.get("video", ()), observation]), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:
-        """Perform one action, or all actions of a choice."""
+        """Perform one action, all actions of a choice, or a `Hold`."""
         frames, total = [], 0.0
-        for part in self._choices[action["choice"].lower()] if self._by_choice else [action]:
+        if isinstance(action, Hold):
+            parts: Actions = [self.hold_action] * action.steps
+            self._limit += action.steps
+        else:
+            parts = self._choices[action["choice"].lower()] if self._by_choice else [action]
+        for part in parts:
             observation, reward, terminated, truncated, info = self.env.step(part)
             frames.append(observation)
             total += float(reward)
             self._steps += 1
-            truncated = bool(truncated) or self._steps >= self.max_steps
+            truncated = bool(truncated) or self._steps >= self._limit
             if terminated or truncated:
                 break
         report = self._info(info, bool(terminated), truncated)
@@ -181,10 +207,15 @@ class EpisodeEnv:
         """Free the environment."""
         self.env.close()
 
+    @property
+    def hold_action(self) -> Any:
+        """The action that keeps the robot where it is."""
+        return self.environment.hold(self.env)
+
     def demonstration(self) -> Iterator[tuple[Mapping[str, Any], Any, bool]]:
         """Observation, action and whether the frame is of the conditioning video, until the demonstrator is done."""
         observation, info = self.env.reset(seed=self.spec.seed)
-        self._goal = str(info["goal"])
+        self.goal = str(info["goal"])
         self.success = False
         actions = self.environment.demonstrate(self.env)
         first = next(actions, None)
@@ -199,11 +230,6 @@ class EpisodeEnv:
             if terminated or truncated or (action := next(actions, None)) is None:
                 return
 
-    @property
-    def goal(self) -> str:
-        """Of the running episode."""
-        return self._goal
-
     def _lists(self, frames: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
         lists: dict[str, list[Any]] = {"state_list": [np.asarray(frame["state"], np.float32) for frame in frames]}
         cameras = [name for name in frames[0] if name != "state"] if frames else []
@@ -216,7 +242,7 @@ class EpisodeEnv:
         success = bool(info.get("success", False))
         over = "fail" if terminated else "timeout" if truncated else "ongoing"
         report: dict[str, Any] = {
-            "task_goal": [self._goal],
+            "task_goal": [self.goal],
             "status": "success" if success and (terminated or truncated) else over,
             "simple_subgoal_online": str(info.get("subgoal", "")),
         }

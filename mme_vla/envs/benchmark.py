@@ -7,6 +7,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
+from mme_vla.errors import require
 from mme_vla.registry import ENVS
 
 
@@ -30,7 +31,6 @@ class RoboMME(Environment):
         return metadata.step_limit(split)
 
     def check_installed(self) -> None:
-        """The simulator."""
         make.require_simulator()
 
     def check_embodiment(self, robot: Embodiment) -> None:
@@ -38,15 +38,16 @@ class RoboMME(Environment):
         check_benchmark(robot, make.ACTION_SPACES)
 
     def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
-        """From the benchmark's metadata."""
         return metadata.episodes(task, split)
 
     def make(self, spec: EpisodeSpec, render: bool = True) -> Any:
         """The episode in joint angles."""
         return make.make_env(spec.task, spec.split, spec.episode, env=self.name, render=render)
 
+    def check_hold(self) -> None:
+        """Every episode takes a `Hold`."""
+
     def open(self, task: str, split: str, episode: int, **options: Any) -> Any:
-        """As `make_env`."""
         return make.make_env(task, split, episode, env=self.name, **options)
 
 
@@ -58,3 +59,7 @@ class Official(RoboMME):
 
     def check_installed(self) -> None:
         """Nothing of this library's simulator; the package is checked when an episode is made."""
+
+    def check_hold(self) -> None:
+        """The package has no action for it in every action space."""
+        require(False, "env=official cannot pause: use env=mme_vla for events in which the robot holds its pose.")

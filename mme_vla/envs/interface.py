@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.envs.base import Hold
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import (
     INTRINSIC,
@@ -93,6 +94,8 @@ class _Run:
     """Frames returned since the reset."""
     count: int = 0
     """Control steps that count towards the limit."""
+    held: int = 0
+    """Control steps for which the robot was told to hold its pose, by which the limit grows."""
     total_reward: float = 0.0
     options: dict[str, Any] = field(default_factory=dict)
     actions: list[Any] = field(default_factory=list)
@@ -199,7 +202,7 @@ class RoboMMEEnv(gymnasium.Env):
         """Perform one action.
 
         Args:
-            action: as the action space describes it.
+            action: as the action space describes it, or a `Hold`.
 
         Returns:
             Observation lists, reward, terminated, truncated (0-d tensors) and the info of the last frame.
@@ -210,7 +213,10 @@ class RoboMMEEnv(gymnasium.Env):
         run.frames = []
         run.actions.append(deepcopy(action))
         try:
-            self._space.act(run.control, action)
+            if isinstance(action, Hold):
+                self._hold(run, action.steps)
+            else:
+                self._space.act(run.control, action)
             before = run.total_reward
             run.total_reward = self._total_reward(self.task.progress, bool(run.info.get("success", False)))
             reward = torch.tensor(run.total_reward - before)
@@ -341,6 +347,16 @@ class RoboMMEEnv(gymnasium.Env):
         run.terminated = terminated.reshape(-1)[0].clone()
         run.truncated = torch.tensor(self._timed_out(run))
 
+    def _hold(self, run: _Run, steps: int) -> None:
+        """Repeat the last command, while the scene goes on, until the episode ends."""
+        run.held += steps
+        for left in reversed(range(steps)):
+            run.control.demonstrator.left = left  # the last one's frame is the newest
+            self._step_control(run.last_action)
+            if run.terminated:
+                break
+        run.control.demonstrator.left = 0
+
     def _demonstrate(self, subtask: "SubTask") -> None:
         """Carry out a sub-task of the video, evaluating before and after it as at recording."""
         self.task.evaluate_planned()
@@ -392,7 +408,7 @@ class RoboMMEEnv(gymnasium.Env):
         return options
 
     def _timed_out(self, run: _Run) -> bool:
-        return run.count >= self.max_steps + _MARGIN
+        return run.count >= self.max_steps + run.held + _MARGIN
 
     def _require_run(self) -> _Run:
         if self._run is None:

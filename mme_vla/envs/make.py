@@ -71,8 +71,11 @@ def make_env(
         The environment; call `reset()` first. Close it when done.
     """
     if env not in ROBOMME:
+        from mme_vla.envs.base import environment
+
         options: Any = {"action_space": action_space, "max_steps": max_steps, "render": render}
-        return _open_registered(env, task, split, episode, options)
+        opened: Any = environment(env).open(task, split, episode, **options)
+        return opened
     check_names(task, action_space, difficulty, seed)
     check_sessions(split, sessions)
     max_steps = metadata.step_limit(split) if max_steps is None else max_steps
@@ -114,12 +117,6 @@ def check_sessions(split: str, sessions: int) -> None:
         "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
         "callers declare them: make_env(…, sessions=2).",
     )
-
-
-def _open_registered(env: str, task: str, split: str, episode: int, options: dict[str, Any]) -> Any:
-    from mme_vla.envs.base import environment
-
-    return environment(env).open(task, split, episode, **options)
 
 
 def check_names(task: str, action_space: str, difficulty: str | None, seed: int | None) -> None:

@@ -212,12 +212,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
         hard = [spec for spec in episodes(task, BASE, folder) if spec.difficulty == HARD]
         return [replace(spec, split=split, episode=i) for i, spec in enumerate(hard)]
     if is_row_split(split):
-        rows = rows_of(task, split, all_tasks())
-        levels = [row.get("tier") or row.get("difficulty", HARD) for row in rows]
-        return [
-            EpisodeSpec(task, split, i, row["seed"], level, row)
-            for i, (row, level) in enumerate(zip(rows, levels, strict=True))
-        ]
+        return [_spec_of(row, split, i) for i, row in enumerate(rows_of(task, split, all_tasks()))]
     if split == CHALLENGE and task in TASK_NAMES:
         return list(_table(split)[task])
     if task not in TASK_NAMES or split not in SPLITS:
@@ -257,8 +252,11 @@ def all_tasks() -> tuple[str, ...]:
 
 def read_row(value: Any) -> EpisodeSpec:
     """The episode that one row of values describes, as `env.scene_values()` gives it."""
-    row = check_row(value, "The row", all_tasks())
-    return EpisodeSpec(row["task"], "rows", 0, row["seed"], row.get("tier") or row.get("difficulty", HARD), row)
+    return _spec_of(check_row(value, "The row", all_tasks()), "rows", 0)
+
+
+def _spec_of(row: Mapping[str, Any], split: str, number: int) -> EpisodeSpec:
+    return EpisodeSpec(row["task"], split, number, row["seed"], row.get("tier") or row.get("difficulty", HARD), row)
 
 
 def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:

@@ -4,7 +4,7 @@ A task says which objects there are (`plan`, `build`, `start_episode`), what hap
 `after_step`), and what is to be done (`subtasks`, `goals`, `choices`). Everything else is here.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -123,6 +123,18 @@ class Task(Stage):
     def cues(self) -> Sequence[Cue]:
         """With `in_view`: the discs that show what is to be remembered; built with the scene, moved at each step."""
         return ()
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        """Names of the facts that the present frame shows and that the episode needs later.
+
+        By default the key poses: the end of each sub-task of the video that a policy could choose, or, in a task
+        without a video, of the execution.
+
+        Args:
+            ended: the sub-tasks that have ended in the last frames, by their number.
+        """
+        has_video = any(subtask.video for subtask in self.progress.subtasks)
+        return {f"{i} {s.text}" for i, s in ended.items() if s.choice and s.video == has_video}
 
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""

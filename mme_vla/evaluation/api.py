@@ -14,9 +14,10 @@ from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
     choose_episodes,
     default_output,
+    evaluate_events,
     facts_of,
 )
-from mme_vla.evaluation.rollout.evaluation import evaluate as evaluate_run
+from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
@@ -34,6 +35,7 @@ def evaluate(
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
     recordings: Any = None,
+    event: str | Sequence[str] | None = None,
     **settings: Any,
 ) -> Evaluation:
     """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
@@ -51,16 +53,18 @@ def evaluate(
         name: what records call the policy; its own name by default.
         base: makes an environment with the benchmark's interface, importable by name.
         recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
+        event: what happens in every episode, such as `"pause:100@subtask:2"`; of a list each by itself. Every episode
+            runs without it too, in `output` itself.
         show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=4` or
         `render=False`.
 
     Returns:
-        The records of these episodes, and `success_rate`.
+        The records of these episodes, and `success_rate`; of those with events, `matched` are the ones without.
 
     >>> evaluate("outputs/framesamp_modul/latest", "StopCube", 5, seed=7).success_rate  # doctest: +SKIP
     0.4
     """
-    run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
+    run_settings, arms = read_section(RolloutSettings, {**settings, "seed": seed}), event_arms(event)
     jobs = choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
     if base is make_env:
         environment(run_settings.env).check_installed()
@@ -72,7 +76,7 @@ def evaluate(
     donor_episodes = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
     options: dict[str, Any] = {"subgoals": predictor, "source": source, "base": base, "show_progress": show_progress}
-    return evaluate_run(wrapped, jobs, folder, facts, run_settings, **options)
+    return evaluate_events(wrapped, jobs, folder, facts, run_settings, arms, **options)
 
 
 def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:

@@ -150,6 +150,9 @@ class FedEpisode(Episode):
             recording.show(self.inner, 0, recording.length, here, video=True)
             before += recording.length
 
+    def restart_clock(self) -> None:
+        self.inner.restart_clock()
+
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
         """Note where sub-tasks began, the execution among them, as numbers of observed frames."""
         self._starts = np.array(sorted({0, exec_start, *frames}), np.int64)

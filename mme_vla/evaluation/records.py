@@ -26,6 +26,7 @@ class RunKey(NamedTuple):
     split: str
     composition: str | None = None
     training: TrainingIdentity | None = None
+    event: str | None = None
 
     def __str__(self) -> str:
         name = self.model if self.subgoal is None else f"{self.model}+{self.subgoal}"
@@ -33,7 +34,8 @@ class RunKey(NamedTuple):
         trained = ""
         if self.training is not None:
             trained = f", training seed {self.training.seed} of recipe {str(self.training.recipe)[:6]}"
-        return f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
+        happens = f", event {self.event}" if self.event else ""
+        return f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}{happens}"
 
 
 class EpisodeKey(NamedTuple):
@@ -72,6 +74,7 @@ class EpisodeRecord:
         under one name; None in records written before there was one, and of players that are no policy of this library.
     training: seed, recipe, data and weights of the training that the checkpoint is of; None in records written before
         checkpoints named it, and of what was not trained.
+    event: what happened in the rollout (`pause:100@subtask:2`); None in the matched arm, which is the plain run.
     extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.
     """
@@ -94,6 +97,7 @@ class EpisodeRecord:
     memory_budget: Integer | None = None
     composition: str | None = None
     training: TrainingIdentity | None = None
+    event: str | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -108,7 +112,7 @@ class EpisodeRecord:
     @property
     def run(self) -> RunKey:
         return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split,
-                      self.composition, self.training)  # fmt: skip
+                      self.composition, self.training, self.event)  # fmt: skip
 
     @property
     def key(self) -> EpisodeKey:

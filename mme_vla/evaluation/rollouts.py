@@ -1,7 +1,7 @@
 """`rollouts`: episodes as data to learn from, with what the policy saw, what it sampled, and what came of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from mme_vla.policy.acting import choose_actions
 from mme_vla.policy.log_prob import SamplePath, log_prob, sample_path
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.registry import REWARDS
-from mme_vla.types import Batch, HistoryTokens
+from mme_vla.types import Batch, HistoryTokens, Labels, TensorStruct
 
 KEEP = ("observations", "rewards", "log_probs", "oracle")
 
@@ -37,6 +37,7 @@ class Trajectory:
     """One episode, decision by decision; t decisions. What `keep` leaves out is None.
 
     job: which episode. outcome: `success`, `fail`, `timeout` or `error`. steps: control steps.
+    error: of an episode that an error ended, its message. Before the first decision t is 0, and there are no rows.
     chunks: [t, h, a], sampled, in the network's units. actions: float32 [n, w] of each decision, executed.
     observations: rows of what the policy saw, with the memory's selection; `actions` are the executed ones in the
         network's units, `action_mask` marks them.
@@ -56,6 +57,7 @@ class Trajectory:
     log_probs: Tensor | None = None
     paths: Tensor | None = None
     oracle: Batch | None = None
+    error: str | None = None
 
     @property
     def success(self) -> bool:
@@ -82,6 +84,8 @@ def rollouts(
     **settings: Any,
 ) -> Iterator[Trajectory]:
     """Run episodes with a policy, and yield each as a trajectory when it ends.
+
+    Every job yields one. An episode that an error ended is tried again `retries` times first.
 
     Args:
         policy: with statistics; its weights may change between two calls, not during one.
@@ -139,38 +143,45 @@ def check_log_prob(policy: MMEPolicy) -> None:
 
 
 def join(batches: Sequence[Batch]) -> Batch:
-    """The rows of several batches as one, prompts padded to the longest."""
-    require(batches, "There are no rows to join.")
-    length = max(batch.prompt.shape[1] for batch in batches)
-    histories = [row for batch in batches if batch.history is not None for row in _unbatched(batch.history)]
+    """The rows of several batches as one, prompts padded to the longest.
 
-    def cat(name: str) -> Any:
+    Raises:
+        UserError: some batches have a field that others lack. Where None counts all rows alike (`weight`,
+            `action_mask`, `options`) it becomes ones instead.
+    """
+    require(batches, "There are no rows to join.")
+    require(
+        all(batch is not None for batch in batches),
+        "None has no rows to join: leave out trajectories that an error ended before their first decision.",
+    )
+    require(len({tuple(batch.labels) for batch in batches}) == 1, "The batches to join have different labels.")
+    length = max(batch.prompt.shape[1] for batch in batches)
+    joined: dict[str, Any] = {}
+    for name in (member.name for member in fields(Batch)):
         values = [getattr(batch, name) for batch in batches]
-        if any(value is None for value in values):
-            return None
+        known = [value for value in values if value is not None]
         if name in ("prompt", "prompt_mask"):
             values = [functional.pad(value, (0, length - value.shape[1])) for value in values]
-        return torch.cat(values)
+        elif known and name in ("weight", "action_mask", "options"):
+            ones = [known[0].new_ones(len(batch.prompt), *known[0].shape[1:]) for batch in batches]
+            values = [one if value is None else value for value, one in zip(values, ones, strict=True)]
+        elif len(known) not in (0, len(values)):
+            raise UserError(f"{len(known)} of {len(values)} batches to join have {name!r}: give it to all, or to none.")
+        joined[name] = _cat(values)
+    return Batch(**joined)
 
-    names = (
-        "images",
-        "image_mask",
-        "prompt",
-        "prompt_mask",
-        "actions",
-        "action_mask",
-        "state",
-        "options",
-        "view_tokens",
-    )
-    past = [batch.past for batch in batches if batch.past is not None]
-    joined_past = (
-        replace(past[0], images=torch.cat([p.images for p in past]), mask=torch.cat([p.mask for p in past]))
-        if past
-        else None
-    )
-    history = stack_history(histories) if histories else None
-    return Batch(**{name: cat(name) for name in names}, history=history, past=joined_past)
+
+def _cat(values: Sequence[Any]) -> Any:
+    """Tensors, labels or structs of tensors as one; of anything else the first."""
+    first = values[0]
+    if isinstance(first, HistoryTokens):
+        return stack_history([row for value in values for row in _unbatched(value)])
+    if isinstance(first, Labels):
+        return Labels({name: torch.cat([value[name] for value in values]) for name in first})
+    if isinstance(first, TensorStruct):
+        members = [member.name for member in fields(first)]  # type: ignore[arg-type]
+        return type(first)(**{name: _cat([getattr(value, name) for value in values]) for name in members})
+    return torch.cat(list(values)) if isinstance(first, Tensor) else first
 
 
 @torch.no_grad()
@@ -234,7 +245,8 @@ class _Collector(Rollout):
         decisions = self._decisions.setdefault(running, [])
         if reply.reward is not None and decisions:
             decisions[-1].reward += float(reply.reward)
-            decisions[-1].actions = decisions[-1].actions[: int(reply.info.get("executed", 0))]
+            if running.events.holding is None:
+                decisions[-1].actions = decisions[-1].actions[: int(reply.info.get("executed", 0))]
         super()._take(reply)
 
     @torch.no_grad()
@@ -291,7 +303,7 @@ class _Collector(Rollout):
         super()._finish(running, status, error, retry)
         (record,) = records
         tried_again = record.outcome == "error" and retry and tries <= self.settings.retries
-        if decisions and not tried_again:
+        if not tried_again:
             self.finished.append(self._trajectory(running.job, record, decisions))
 
     def _trajectory(self, job: Job, record: EpisodeRecord, decisions: list[_Decision]) -> Trajectory:
@@ -305,14 +317,19 @@ class _Collector(Rollout):
             job,
             record.outcome,
             record.steps,
-            torch.stack([d.chunk for d in decisions]),
+            torch.stack([d.chunk for d in decisions]) if decisions else torch.zeros(0, *self._chunk_shape),
             tuple(d.actions for d in decisions),
             join(executed) if "observations" in keep and rows else None,
             torch.tensor([d.reward for d in decisions]) if "rewards" in keep else None,
             torch.stack(log_probs) if log_probs else None,
             torch.stack(paths) if paths else None,
             join([self._labelled(*target) for target in targets]) if "oracle" in keep and targets else None,
+            record.error,
         )
+
+    @property
+    def _chunk_shape(self) -> tuple[int, int]:
+        return self.policy.horizon, self.policy.action_dim
 
     def _labelled(self, row: Batch, state: Tensor, actions: np.ndarray) -> Batch:
         """A row with these actions [n, w] in the network's units, repeated to a chunk, of which they alone count."""

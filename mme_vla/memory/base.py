@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, check_choice, require
 from mme_vla.memory.history import FrameScorer, History, LazyHistory, OnlineHistory, StorageSpec
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens
 
@@ -126,7 +126,7 @@ class MemoryModule(nn.Module):
         if len(indices) > self.capacity:
             raise ValueError(f"{type(self).__name__}.select returned {len(indices)} tokens; at most {self.capacity}.")
         features = history.gather(indices)
-        positions = torch.from_numpy(token_positions(indices, self.storage.grid)).to(features.device)
+        positions = torch.from_numpy(token_positions(history.timed(indices), self.storage.grid)).to(features.device)
         missing = self.padded_length(len(indices)) - len(indices)
         before, after = (missing, 0) if self.pad_left else (0, missing)
         mask = torch.ones(len(indices), dtype=torch.bool, device=features.device)
@@ -134,7 +134,7 @@ class MemoryModule(nn.Module):
             features=nn.functional.pad(features, (0, 0, before, after)),
             positions=nn.functional.pad(positions, (0, 0, before, after)),
             mask=nn.functional.pad(mask, (before, after)),
-            step=torch.tensor(step, device=features.device),
+            step=torch.tensor(int(history.times(np.array(step))), device=features.device),
         )
 
 
@@ -221,7 +221,7 @@ class ScoringMemory:
 
 
 class ProprioMemory:
-    """Capability of a memory: it reads proprioception and motion (`History.motion`) instead of stored tokens."""
+    """Capability of a memory: it reads proprioception and motion (`History.motion`), with stored tokens or without."""
 
     uses_proprio: bool = True
 
@@ -371,34 +371,62 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
     return torch.cat([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
 
+POSITIONS = ("time_space", "space", "none")
+"""What a memory's tokens say of their frame, row and column: all three, row and column, or nothing."""
+
+
 class FeatureEncoder(nn.Module):
     """token = W₂ [feature | SiLU(W₁ position)]: nothing before, between or after, as released.
 
     Positions are `position_dim` wide: by default 3/8 of the vision width in multiples of 6, 768 at full size.
 
     Padding (zero feature, zero position) becomes the constant W₂ [0 | SiLU(b₁)]: only the mask tells it apart.
+
+    With `positions="space"` the features of the frame, the first third, are zero. With `"none"` there is no W₁, and
+    token = W₂ feature, which is the released encoder with `use_pos_emb: false`.
     """
 
-    def __init__(self, d_vision: int, width: int, position_dim: int | None = None, position_hidden: int | None = None):
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        position_dim: int | None = None,
+        position_hidden: int | None = None,
+        positions: str | None = None,
+    ):
         super().__init__()
+        self.positions = POSITIONS[0] if positions is None else positions
+        check_choice("memory.positions", self.positions, POSITIONS)
         for name, size in (("position_dim", position_dim), ("position_hidden", position_hidden)):
             require(size is None or size >= 1, f"memory.{name}={size}: must be at least 1, or null for its default.")
         self.position_dim = max(48, 6 * (d_vision // 16)) if position_dim is None else position_dim
         hidden = self.position_dim if position_hidden is None else position_hidden
-        self.position = nn.Linear(self.position_dim, hidden)
-        self.project = nn.Linear(d_vision + hidden, width)
+        none = self.positions == "none"
+        self.position = None if none else nn.Linear(self.position_dim, hidden)
+        self.project = nn.Linear(d_vision + hidden * (not none), width)
         for layer in (self.position, self.project):
-            nn.init.normal_(layer.weight, std=0.02)
-            nn.init.zeros_(layer.bias)
+            if layer is not None:
+                nn.init.normal_(layer.weight, std=0.02)
+                nn.init.zeros_(layer.bias)
 
-    def encode(self, features: Tensor, position: Tensor) -> Tensor:
+    def places(self, positions: Tensor) -> Tensor:
+        """Position features [b, n, position_dim] of positions [b, n, 3], float32."""
+        places = position_features(positions, self.position_dim)
+        if self.positions == "space":
+            places = torch.cat([torch.zeros_like(places[..., : self.position_dim // 3]),
+                                places[..., self.position_dim // 3 :]], -1)  # fmt: skip
+        return places
+
+    def encode(self, features: Tensor, places: Tensor) -> Tensor:
         """Encode features [b, n, d_vision] with ready-made position features [b, n, position_dim]."""
-        place = nn.functional.silu(self.position(position.to(self.position.weight.dtype)))
+        if self.position is None:
+            return self.project(features.to(self.project.weight.dtype))
+        place = nn.functional.silu(self.position(places.to(self.position.weight.dtype)))
         return self.project(torch.cat([features.to(place.dtype), place], dim=-1))
 
     def forward(self, features: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
         """Encode features at positions [b, n, 3]; padding gets zero position features, not those of (0, 0, 0)."""
-        return self.encode(features, position_features(positions, self.position_dim) * mask[..., None])
+        return self.encode(features, self.places(positions) * mask[..., None])
 
 
 class PerceptualMemory(MemoryModule):
@@ -414,6 +442,7 @@ class PerceptualMemory(MemoryModule):
         storage: StorageSpec,
         position_dim: int | None = None,
         position_hidden: int | None = None,
+        positions: str | None = None,
     ) -> None:
         """Build the encoder.
 
@@ -421,11 +450,12 @@ class PerceptualMemory(MemoryModule):
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             budget: most memory tokens. storage: what is kept of each frame.
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
+            positions: of `POSITIONS`; None: `time_space`.
         """
         super().__init__()
         self.budget = self.capacity = budget
         self.storage = storage
-        self.encoder = FeatureEncoder(d_vision, width, position_dim, position_hidden)
+        self.encoder = FeatureEncoder(d_vision, width, position_dim, position_hidden, positions)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         tokens = self.encoder(history.features, history.positions, history.mask)

@@ -16,6 +16,17 @@ def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
     return np.arange(step + 1) if step < count else np.linspace(0, step, count).astype(np.int64)
 
 
+def whole_frames(budget: int, grid: int, at_least: int = 1) -> int:
+    """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole ones, and enough."""
+    least = max(budget // grid**2, at_least) * grid**2
+    require(
+        budget == least,
+        f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames, at least {at_least}: choose a "
+        f"multiple of {grid**2}, such as {least}.",
+    )
+    return budget // grid**2
+
+
 @MEMORIES.register("framesamp")
 class FrameSamp(PerceptualMemory):
     """budget / grid² frames of grid×grid tokens each: 32 frames of 16 tokens as released."""
@@ -35,13 +46,9 @@ class FrameSamp(PerceptualMemory):
         Args:
             every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor encoded. 1: all.
         """
-        require(
-            budget % grid**2 == 0 and budget >= grid**2,
-            f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
-            f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}.",
-        )
+        frames = whole_frames(budget, grid)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
-        self.frames = budget // grid**2
+        self.frames = frames
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([self.chosen(int(step)) for step in steps])

@@ -116,6 +116,8 @@ class History:
 
     motion: Callable[[np.ndarray], Tensor] | None = None
     state_width: int = 0
+    clock_starts: tuple[int, ...] = (0,)
+    """Frames at which the frame index began at 0: the first one, and those of restarts."""
 
     def __init__(self, spec: StorageSpec, exec_start: int = 0) -> None:
         self.spec = spec
@@ -137,6 +139,20 @@ class History:
     def gather(self, indices: np.ndarray) -> Tensor:
         """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch)."""
         raise NotImplementedError
+
+    def restart_clock(self) -> None:
+        """Count the current frame as 0 again; earlier ones keep their times."""
+        self.clock_starts = (*self.clock_starts, max(len(self) - 1, 0))
+
+    def times(self, frames: np.ndarray) -> np.ndarray:
+        """The frame index that frames [n] have: their number, or counted from the last restart before them."""
+        starts = np.array(self.clock_starts)
+        times: np.ndarray = frames - starts[np.searchsorted(starts, frames, side="right") - 1]
+        return times
+
+    def timed(self, indices: np.ndarray) -> np.ndarray:
+        """`indices` [n, 2] of (frame, patch) as (time, patch)."""
+        return np.stack([self.times(indices[:, 0]), indices[:, 1]], axis=1)
 
     def stored(self, indices: np.ndarray) -> Tensor:
         """`gather` without what a prompt does to tokens: what a selection may look at, in training as in episodes."""
@@ -312,6 +328,7 @@ class PromptConditionedHistory(History):
         super().__init__(source.spec, source.exec_start)
         self._source, self._condition = source, condition
         self.motion, self.state_width = source.motion, source.state_width
+        self.clock_starts = source.clock_starts
 
     def __len__(self) -> int:
         return len(self._source)

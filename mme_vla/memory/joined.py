@@ -187,6 +187,7 @@ class CoarserHistory(History):
     def __init__(self, stored: History, spec: StorageSpec) -> None:
         super().__init__(spec, stored.exec_start)
         self._stored, self.motion, self.state_width = stored, stored.motion, stored.state_width
+        self.clock_starts = stored.clock_starts
 
     def __len__(self) -> int:
         return len(self._stored)

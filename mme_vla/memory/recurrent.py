@@ -185,6 +185,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         chunk: int = 8,
         position_dim: int | None = None,
         position_hidden: int | None = None,
+        positions: str | None = None,
     ) -> None:
         """Put the parts together.
 
@@ -198,6 +199,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
                 randomness (`data.jitter`).
             chunk: frames that are recomputed together in the backward pass; windows are padded to a multiple of it.
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
+            positions: of `POSITIONS`; None: `time_space`.
         """
         super().__init__()
         check_sizes("memory", max_steps=max_steps, max_video=max_video, stride=stride, chunk=chunk)
@@ -206,7 +208,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         self.storage = StorageSpec(grid, pooling)
         self.max_steps, self.max_video, self.stride = max_steps, max_video, stride
         self.jitter, self.chunk = jitter, chunk
-        self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden)
+        self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden, positions)
         self.layer = layer
         self._compiled: Callable[..., tuple[State, Statistics]] | None = None
         self.output = nn.Linear(hidden, width)
@@ -348,7 +350,8 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         state = _stack([taken.state or self.init_state(1) for _, taken, _ in group])
         indices = [all_patches(new, self.storage.grid) for _, _, new in group]
         features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
-        positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
+        pairs = zip(group, indices, strict=True)
+        positions = np.stack([token_positions(history.timed(at), self.storage.grid) for (history, _, _), at in pairs])
         everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
         state = self.update(state, features, torch.from_numpy(positions).to(features.device), everywhere)
         for i, (_, taken, new) in enumerate(group):

@@ -1,15 +1,17 @@
 """The goal's words through an encoder that does not learn: asked once for each goal, and known by its name alone."""
 
 import hashlib
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.errors import UserError, brief, require
-from mme_vla.processing.base import PolicyProcessor, read_settings
+from mme_vla.errors import UserError, brief, missing_extra, require
+from mme_vla.processing.base import PolicyProcessor, PromptSpec, read_settings
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import checked_text
 from mme_vla.utils import check_sums, inside
@@ -42,32 +44,99 @@ def direction_of(word: str, width: int) -> Tensor:
     return torch.randn(width, generator=torch.Generator().manual_seed(seed))
 
 
-def load_with_goal_encoder[P: PolicyProcessor](
-    kind: type[P], name: str, folder: Path, encoder: Path | str | None, trusted: tuple[str, ...]
-) -> P:
-    """Build a processor whose `text` names an encoder from a folder of a checkpoint, which may be untrusted.
+class ClipEncoder(GoalEncoder):
+    """A CLIP's tokenizer and text tower, frozen, on the CPU; loaded with the first text.
 
     Args:
-        name: of this kind of processor. encoder: in place of what `processor.json` names. trusted: encoders that are
-            taken on a checkpoint's word.
+        source: the hub's name of a CLIP, or a folder as transformers writes them.
+
+    method: what it is for. tower: its class in transformers. size, option: how its configuration and this library's
+    call the width.
     """
-    settings = read_settings(folder)
-    require(settings.pop("name", None) == name, f"{folder} holds a processor of another kind of policy.")
-    text, stats = settings.get("text"), settings.pop("stats", None)
-    if encoder is not None:
-        settings["text"] = str(encoder)
-    elif text not in trusted:
-        raise UserError(
-            f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a checkpoint's word. If "
-            f"you trust it: from_pretrained(…, tokenizer={brief(text, 200)})."
+
+    method: ClassVar[str]
+    tower: ClassVar[str]
+    size: ClassVar[str]
+    option: ClassVar[str]
+
+    def __init__(self, width: int, source: str | Path) -> None:
+        super().__init__(width)
+        self.source = str(source)
+
+    @cached_property
+    def parts(self) -> tuple[Any, Any]:
+        """The tokenizer and the tower."""
+        try:
+            import transformers
+        except ImportError:
+            raise missing_extra(self.method, "baselines") from None
+        try:
+            tokenizer = transformers.CLIPTokenizer.from_pretrained(self.source)
+            tower = getattr(transformers, self.tower).from_pretrained(self.source)
+        except (OSError, ValueError) as error:
+            raise UserError(
+                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]}). Connect once so that it "
+                "is kept, give a folder that holds it (processor.text=<folder>), or try things out with "
+                "processor.text=hashed."
+            ) from None
+        width = getattr(tower.config, self.size)
+        require(
+            width == self.width,
+            f"{self.source} gives {width} numbers, the network reads {self.width}: set {self.option}.",
         )
-    try:
-        options: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
-        if stats is not None:
-            require(isinstance(stats, str), f"stats={brief(stats)} must be the name of a file.")
-            path = inside(folder, stats, "statistics")
-            check_sums(folder, [stats])
-            options["stats"] = NormStats.load(path)
-        return kind(**options, **settings)
-    except (TypeError, ValueError, KeyError, IndexError) as error:
-        raise UserError(f"{folder}: its processor cannot be built ({error}).") from None
+        return tokenizer, tower.eval().requires_grad_(False)
+
+
+class GoalProcessor(PolicyProcessor):
+    """A processor whose prompt is what its encoder `text` makes of the goal; nothing else is read.
+
+    name: the processor's in `processor.json`. trusted: encoders that are taken on a checkpoint's word.
+    """
+
+    name: ClassVar[str]
+    trusted: ClassVar[tuple[str, ...]] = (HASHED,)
+    text: GoalEncoder
+    text_name: str
+
+    @property
+    def prompt_spec(self) -> PromptSpec:
+        return PromptSpec(self.text_name)
+
+    def prompt(
+        self,
+        goal: str,
+        subgoal: str | None = None,
+        state: np.ndarray | Tensor | None = None,
+        past_actions: np.ndarray | Tensor | None = None,
+    ) -> Tensor:
+        return self.text(goal)
+
+    @classmethod
+    def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
+        """Read what `save` wrote.
+
+        Args:
+            folder: of a checkpoint, which may be untrusted.
+            tokenizer: the folder of a CLIP, in place of what `processor.json` names.
+        """
+        folder = Path(folder)
+        settings = read_settings(folder)
+        require(settings.pop("name", None) == cls.name, f"{folder} holds a processor of another kind of policy.")
+        text, stats = settings.get("text"), settings.pop("stats", None)
+        if tokenizer is not None:
+            settings["text"] = str(tokenizer)
+        elif text not in cls.trusted:
+            raise UserError(
+                f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a checkpoint's word. If "
+                f"you trust it: from_pretrained(…, tokenizer={brief(text, 200)})."
+            )
+        try:
+            options: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
+            if stats is not None:
+                require(isinstance(stats, str), f"stats={brief(stats)} must be the name of a file.")
+                path = inside(folder, stats, "statistics")
+                check_sums(folder, [stats])
+                options["stats"] = NormStats.load(path)
+            return cls(**options, **settings)
+        except (TypeError, ValueError, KeyError, IndexError) as error:
+            raise UserError(f"{folder}: its processor cannot be built ({error}).") from None

@@ -303,7 +303,7 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
             nothing,
             np.zeros(demonstration.length, bool),
         )
-        history.motion = motion.__getitem__
+        history.motion, history.state_width = motion.__getitem__, policy.embodiment.state.width
     return history
 
 

@@ -81,7 +81,6 @@ class RandomPlayer(Player):
         self._draws = np.random.default_rng([self.seed, zlib.crc32(which.task.encode()), which.seed])
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See `Player`."""
         option = session.options[self._draws.integers(len(session.options))]
         point = self._draws.integers(SIDE, size=2).tolist() if option.needs_point else None
         return {"choice": option.label, "point": point}, {}
@@ -98,7 +97,6 @@ class OraclePlayer(Player):
     needs_images = False
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See `Player`."""
         from mme_vla.envs.oracle import OracleStuckError, oracle_choice
 
         task = getattr(session.env, "task", None)

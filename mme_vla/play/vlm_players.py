@@ -144,11 +144,9 @@ class ModelPlayer(Player):
         self._before = Usage()
 
     def start(self, session: ChoiceSession) -> None:
-        """See `Player`."""
         self._before = replace(self.usage, problems=self.usage.problems.copy())
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See `Player`."""
         replies: list[str] = []
         complaint = ""
         for _ in range(self.tries):
@@ -214,7 +212,6 @@ class QwenPlayer(ModelPlayer):
         self.vlm.processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": most}
 
     def ask(self, session: ChoiceSession, complaint: str) -> str:
-        """See `ModelPlayer`."""
         started = time.perf_counter()
         (completion,) = self.vlm.generate([self.question(session, complaint)], self.max_new_tokens)
         self.usage.seconds += time.perf_counter() - started
@@ -257,12 +254,10 @@ class GeminiPlayer(ModelPlayer):
         self._conversation: list[tuple[str, list[Any]]] = []
 
     def start(self, session: ChoiceSession) -> None:
-        """See `Player`."""
         super().start(session)
         self._conversation = []
 
     def ask(self, session: ChoiceSession, complaint: str) -> str:
-        """See `ModelPlayer`."""
         message = ("user", [complaint] if complaint else self._news(session))
         try:
             reply = self.api.ask(SYSTEM, [*self._conversation, message])

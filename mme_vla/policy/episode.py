@@ -270,6 +270,16 @@ class Episode:
         space = self._robot.action
         self.action_prefix = checked_prefix(actions, delay, space.horizon, space.width)
 
+    def restart_clock(self) -> None:
+        """Count the current frame as 0 again; what is remembered keeps its times.
+
+        Raises:
+            UserError: the policy has no memory that numbers frames.
+        """
+        if self.history is None:
+            raise UserError("The clock of this policy cannot restart: it has no memory that numbers frames.")
+        self.history.restart_clock()
+
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
         """Note the frames at which sub-tasks began, if the environment reports them; only probes use it."""
 

@@ -12,14 +12,15 @@ from mme_vla.data.sources import open_sources
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.evaluation.api import load
 from mme_vla.evaluation.recordings import Recording, all_recordings
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, facts_of
+from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, evaluate_events, facts_of
+from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import claim_run, find_records, fingerprint, read_folders
@@ -40,12 +41,16 @@ NO_DATA = (
 )
 
 
+IN_CLOSED_LOOP = "event=…: events act in closed loop: add online=true to the command, or tasks=… in Python."
+
+
 @dataclass(frozen=True)
 class ProbePlan:
     """What is probed.
 
     arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
     jobs: episodes of the closed loop, none for none. source: where the weights are from.
+    events: further arms of the closed loop, in the simulation.
     """
 
     arms: Any = None
@@ -55,6 +60,7 @@ class ProbePlan:
     offline: OfflineSettings = field(default_factory=OfflineSettings)
     shard: Shard = field(default_factory=Shard)
     source: str | None = None
+    events: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,10 @@ def run_probe(
                 settings, subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
                 notes={"arm": arm.name}, show_progress=show_progress,
             )  # fmt: skip
+        if plan.events:
+            evaluate_events(policy, plan.jobs, folder / ONLINE / slug(UNPROBED.name), facts, settings, plan.events,
+                            subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
+                            notes={"arm": UNPROBED.name}, show_progress=show_progress)  # fmt: skip
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
     comparisons = _paired(records, facts.split, facts.model)
@@ -154,6 +164,7 @@ def probe(
     name: str | None = None,
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
+    event: str | Sequence[str] | None = None,
     **settings: Any,
 ) -> Probe:
     """Measure what a policy takes from its memory; what `output` holds already is not run again.
@@ -168,7 +179,8 @@ def probe(
         draws: chunks sampled at each step. moments: most steps of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
-        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
+        show_progress: whether a progress bar is shown. event: further arms of the closed loop, as for `evaluate`.
+        settings: of `RolloutSettings`, such as `workers=2`.
 
     Returns:
         Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
@@ -178,6 +190,8 @@ def probe(
     run_settings = read_section(RolloutSettings, {**settings, "seed": seed})
     if recordings is None and tasks is None:
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
+    arms_of_events = event_arms(event)
+    require(tasks is not None or not arms_of_events, IN_CLOSED_LOOP)
     loaded, source = load(policy)
     recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
@@ -186,7 +200,7 @@ def probe(
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
-    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source)
+    plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)
     folder = Path(output).expanduser()
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress
@@ -208,7 +222,7 @@ def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Co
         return []
     protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
     methods = aggregate(records, protocol, split).methods
-    baseline = next((method for method in methods if method.model == model), None)
+    baseline = next((method for method in methods if method.model == model and method.event is None), None)
     if baseline is None:
         return []
     return compare_all([(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)], protocol)

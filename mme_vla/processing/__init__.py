@@ -14,22 +14,7 @@ from mme_vla.processing.prompt import PROMPTS, PromptFormat, PromptInput, Subgoa
 from mme_vla.processing.tokenizer import Tokenizer
 
 __all__ = [
-    "PROMPTS",
-    "NormStats",
-    "Processor",
-    "PromptFormat",
-    "PromptInput",
-    "QuantileStats",
-    "RunningStats",
-    "SubgoalText",
-    "Tokenizer",
-    "as_uint8_frames",
-    "augment_views",
-    "encode_prompt",
-    "normalize",
-    "pad_width",
-    "resize_with_pad",
-    "resize_with_pad_uint8",
-    "to_unit_range",
-    "unnormalize",
-]
+    "PROMPTS", "NormStats", "Processor", "PromptFormat", "PromptInput", "QuantileStats", "RunningStats", "SubgoalText",
+    "Tokenizer", "as_uint8_frames", "augment_views", "encode_prompt", "normalize", "pad_width", "resize_with_pad",
+    "resize_with_pad_uint8", "to_unit_range", "unnormalize",
+]  # fmt: skip

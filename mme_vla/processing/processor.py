@@ -298,11 +298,9 @@ class Processor(PolicyProcessor):
         return torch.tensor(ids + [0] * (length - len(ids)))
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Batch:
-        """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
         return collate(items)
 
     def to_config(self) -> dict[str, Any]:
-        """Describe this processor as `processor.json` does; file names are relative to the folder `save` wrote."""
         on_hub = self.tokenizer.spec.startswith(HUB)
         return {
             "image_size": self.image_size,

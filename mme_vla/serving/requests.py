@@ -102,7 +102,7 @@ class Infer:
     first: whether the message begins an episode; None where the schema does not say.
     options: what can be chosen, for a policy that chooses; none where they stay as they were.
     states: what the robot felt at `frames`, [t, s].
-    seen: for a robot that reads more than images, everything its cameras delivered at the frames of this message, in
+    observed: for a robot that reads more than images, all that its cameras delivered at the frames of this message, in
         the form of `Episode.observe`: images by camera, depth and poses; `states` goes with it.
     """
 
@@ -294,8 +294,7 @@ def _image(key: str, image: Any) -> np.ndarray:
     require(fits, f"{key} must be a uint8 image [height, width, 3], got {got}.")
     low, high = sorted(image.shape[:2])
     require(
-        low >= SIDES[0] and high <= SIDES[1],
-        f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}.",
+        low >= SIDES[0] and high <= SIDES[1], f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {got}."
     )
     require(high <= 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
     checked: np.ndarray = image

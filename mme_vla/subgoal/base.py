@@ -177,13 +177,12 @@ class SubgoalPredictor:
         log.warning("Subgoal answer unusable (%s) at step %d, the last one is kept: %s", problem, episode.step, reason)
         return Subgoal(episode.subgoal.text, episode.subgoal.points, queried=True, reply=reply, problem=problem)
 
+    def unreadable(self, episode: SubgoalEpisode, reply: str, error: MalformedReply) -> Subgoal:
+        """As `unchanged`, after a reply that is empty or malformed."""
+        return self.unchanged(episode, "malformed" if reply.strip() else "empty", reply, str(error))
+
     def close(self) -> None:
         """Give back what the predictor holds."""
-
-
-def problem_of(reply: str, error: MalformedReply) -> tuple[str, str]:
-    """Which of `PROBLEMS` an unusable reply is, and the reason."""
-    return ("malformed" if reply.strip() else "empty"), str(error)
 
 
 def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None:

@@ -7,11 +7,11 @@ import numpy as np
 
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import merge_keyframes, recent_frames
-from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import Question
 from mme_vla.subgoal.qwenvl import VLMPredictor
-from mme_vla.subgoal.text import MalformedReply, memer_system, memer_user, parse_memer
+from mme_vla.subgoal.text import MEMER_SYSTEM, MalformedReply, memer_user, parse_memer
 
 
 class MemerEpisode(SubgoalEpisode):
@@ -74,7 +74,7 @@ class Memer(VLMPredictor):
         video = len(episode.video) > 0
         user = memer_user(episode.goal, len(episode.keyframes), len(recent), video)
         images = [*episode.keyframes.values(), *recent.values()]
-        return Question(memer_system(), user, images, [Clip.of(episode.video)] if video else [])
+        return Question(MEMER_SYSTEM, user, images, [Clip.of(episode.video)] if video else [])
 
     def predict_due(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
         _ = [episode.frame for episode in episodes]  # every episode has seen something
@@ -87,8 +87,7 @@ class Memer(VLMPredictor):
         try:
             parsed, positions = parse_memer(reply, len(recent))
         except MalformedReply as error:
-            problem, reason = problem_of(reply, error)
-            return self.unchanged(episode, problem, reply, reason)
+            return self.unreadable(episode, reply, error)
         numbers = list(recent)
         episode.add_keyframes({numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance)
         return self.accepted(parsed, reply)

@@ -9,7 +9,7 @@ import numpy as np
 from mme_vla.errors import require
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until
-from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
 from mme_vla.subgoal.text import MalformedReply, parse_subgoal, subgoal_system, subgoal_user, write_boxes
@@ -98,7 +98,6 @@ class QwenVL(VLMPredictor):
         try:
             parsed = parse_subgoal(reply)
         except MalformedReply as error:
-            problem, reason = problem_of(reply, error)
-            return self.unchanged(episode, problem, reply, reason)
+            return self.unreadable(episode, reply, error)
         episode.history.add(parsed.entry, parsed.points)
         return self.accepted(parsed, reply)

@@ -19,7 +19,7 @@ KINDS = ("simple", "grounded")
 
 _PHRASE = {"simple": "language subgoal", "grounded": "grounded language subgoal"}
 _SYSTEM = "You are a helpful assistant to help guide the robot to complete the task by predicting a sequence of {}s"
-_MEMER_SYSTEM = (
+MEMER_SYSTEM = (
     "You are a robot program that predicts actions. The current input images from the front-view camera shows the most "
     "recent actions the robot has executed. The past keyframes are selected frames of particular importance from all "
     "the actions the robot has executed so far. Based on these, output the current subtask the robot should execute "
@@ -57,10 +57,6 @@ def subgoal_user(kind: str, goal: str, history: Sequence[str], video: bool) -> s
 def numbered(history: Sequence[str]) -> str:
     """`1. pick up the cube; 2. put it down`."""
     return "; ".join(f"{i}. {text}" for i, text in enumerate(history, 1))
-
-
-def memer_system() -> str:
-    return _MEMER_SYSTEM
 
 
 def memer_user(goal: str, keyframes: int, recent: int, video: bool) -> str:

@@ -21,11 +21,14 @@ PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context"
 RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
 NEURAL = [*PERCEPTUAL, *RECURRENT]
 """The paper's."""
-BEYOND_MEMORIES = ("retrieval", "moment", "gist", "actions", "learned_topk")
+BEYOND_MEMORIES = (
+    "retrieval", "moment", "gist", "actions", "learned_topk", "anchors", "events", "pyramid", "keyframes",
+)  # fmt: skip
 """On every backbone with a place for tokens; `spacetime` needs one whose tower looks back."""
 ALL_BEYOND = [f"{m}_{i}" for m in (*BEYOND_MEMORIES, "spacetime") for i in ("context", "modul", "expert")]
 BEYOND = [
     "retrieval_modul", "moment_context", "gist_expert", "actions_expert", "learned_topk_context", "spacetime_context",
+    "anchors_context", "events_modul", "pyramid_expert", "keyframes_modul",
 ]  # fmt: skip
 """Of each memory beyond the paper one composition, for tests that go through all models."""
 MODELS = ["pi05", *NEURAL]

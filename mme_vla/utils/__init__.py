@@ -2,7 +2,6 @@
 
 from mme_vla.utils.checksums import SUMS, Sums, check_sums, file_sum, sum_line, write_sums
 from mme_vla.utils.io import (
-    append_lines,
     decoding,
     disk_trouble,
     draft_of,
@@ -19,7 +18,6 @@ from mme_vla.utils.io import (
     remove_drafts,
     require_file,
     safe_name,
-    to_dataclass,
     to_json,
     to_line,
     user_cache,
@@ -32,9 +30,9 @@ from mme_vla.utils.locks import PLAN, FolderLock, claim_plan, drop_plan
 from mme_vla.utils.processes import files_to_hold
 
 __all__ = [
-    "PLAN", "SUMS", "FolderLock", "Sums", "append_lines", "check_sums", "claim_plan", "decoding", "disk_trouble",
+    "PLAN", "SUMS", "FolderLock", "Sums", "check_sums", "claim_plan", "decoding", "disk_trouble",
     "draft_of", "drop_plan", "file_sum", "files_to_hold", "inside", "is_alive", "is_draft", "is_text", "name_place",
     "parse_json", "read_bytes", "read_json", "read_lines", "read_text", "remove_drafts", "require_file", "safe_name",
-    "sum_line", "to_dataclass", "to_json", "to_line", "user_cache", "verified", "with_checksum", "write_atomically",
+    "sum_line", "to_json", "to_line", "user_cache", "verified", "with_checksum", "write_atomically",
     "write_json", "write_sums",
 ]  # fmt: skip

@@ -10,18 +10,15 @@ import os
 import re
 import socket
 import stat
-import types
 import uuid
 import warnings
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
-from functools import cache
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any
 
-from mme_vla.errors import UserError, brief, listed, require
+from mme_vla.errors import UserError, brief, require
 
 # "errno = 28" (HDF5), "os error 28" (Rust)
 _NUMBER = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
@@ -259,7 +256,7 @@ def read_lines[T](
     without a line end is ignored with a warning: a killed process was writing it.
 
     Args:
-        kind: makes a value from a line's object, such as `partial(to_dataclass, EpisodeLine)`, or `dict`.
+        kind: makes a value from a line's object, such as a class's `from_dict`, or `dict`.
         finite: raise an error for NaN and infinities.
     """
     # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
@@ -286,57 +283,9 @@ def _read_line[T](line: bytes, kind: Callable[[dict[str, Any]], T], source: str,
         raise UserError(f"{source}: {error}") from None
 
 
-def append_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Append objects as JSON lines, each with its checksum, in one write that is on disk when this returns."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("ab") as file:
-        file.write("".join(to_line(row) + "\n" for row in rows).encode())
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def to_line(row: Mapping[str, Any]) -> str:
     """An object as one JSON line with its checksum, without the line end."""
     return json.dumps(with_checksum(row), ensure_ascii=False, separators=(",", ":"))
-
-
-def to_dataclass[T](cls: type[T], values: Mapping[str, Any]) -> T:
-    """Build a dataclass from an object of a file: every field is known, present and of the annotated type."""
-    types, members = _type_hints(cls), {member.name: member for member in fields(cls)}  # type: ignore[arg-type]
-    required = [n for n, m in members.items() if m.default is MISSING and m.default_factory is MISSING]
-    missing, unknown = sorted(set(required) - set(values)), sorted(set(values) - set(members))
-    require(
-        not missing and not unknown,
-        f"not a {cls.__name__}: missing {listed(missing) or 'nothing'}, unknown {listed(unknown) or 'nothing'}.",
-    )
-    for name, value in values.items():
-        if not _is_of(value, types[name]):
-            raise UserError(f"{cls.__name__}.{name}={brief(value)}: expected {_type_name(types[name])}.")
-    return cls(**values)
-
-
-@cache
-def _type_hints(cls: type) -> dict[str, Any]:
-    return get_type_hints(cls)
-
-
-def _type_name(expected: Any) -> str:
-    return expected.__name__ if isinstance(expected, type) and not get_args(expected) else str(expected)
-
-
-def _is_of(value: Any, expected: Any) -> bool:
-    """Whether a JSON value has a type such as `int`, `float | None` or `list[int]`; an integer is a float as well."""
-    origin, inner = get_origin(expected), get_args(expected)
-    if expected is Any:
-        return True
-    if origin in (Union, types.UnionType):
-        return any(_is_of(value, option) for option in inner)
-    if origin is list:
-        return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
-    if expected in (int, float):
-        numbers = int if expected is int else (int, float)
-        return isinstance(value, numbers) and not isinstance(value, bool) and not abs(value) >= 2**63
-    return isinstance(value, origin or expected)
 
 
 CHECKSUM = "crc32"

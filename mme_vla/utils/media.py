@@ -75,7 +75,7 @@ def write_video(frames: Iterable[np.ndarray], path: Path, **options: Any) -> int
     """Write frames of one size as a video that appears only when it is whole; return their number.
 
     Args:
-        options: as `Film`.
+        options: as `VideoWriter`.
 
     Raises:
         ValueError: there is no frame.

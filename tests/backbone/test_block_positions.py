@@ -1,13 +1,17 @@
 """Blocks may have positions of several coordinates."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from mme_vla import MMEPolicy, build_policy
+from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.backbone.layers import Block, apply_custom_positions, rotation
+from mme_vla.integration.context import Context
+from mme_vla.types import MemoryTokens
 
 
 def block(positions: Tensor | None, count: int = 3) -> Block:
@@ -57,3 +61,22 @@ def test_the_backbone_reads_coordinates_of_image_tokens() -> None:
     with torch.no_grad():
         assert torch.equal(velocity(None), velocity(counted))
         assert not torch.equal(velocity(None), velocity(shifted))
+
+
+class PlacedContext(Context):
+    """Memory tokens at positions of three coordinates."""
+
+    def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
+        made, *others = super().blocks(observation, memory)
+        return [replace(made, positions=torch.zeros(1, len(made), 3)), *others]
+
+
+@pytest.mark.parametrize(
+    ("model", "backbone"), [("framesamp_context", "nano"), ("openvla_oft_framesamp_context", "openvla_tiny")]
+)
+def test_a_backbone_that_counts_tokens_itself_refuses_coordinates(model: str, backbone: str) -> None:
+    policy: Any = build_policy(model, backbone=backbone)
+    policy.integration.__class__ = PlacedContext
+    kind = type(policy.backbone).__name__
+    with pytest.raises(UserError, match=rf"'memory' has positions of 3 numbers a token, and {kind} .*Allowed here"):
+        policy.sample_actions(policy.full_batch())

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from helpers import commands
 from mme_vla.cli.command import check_overrides, options_first
-from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.composition import compose, config_dir, import_plugins
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
@@ -123,6 +123,12 @@ def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
     )
     with pytest.raises(UserError, match="Unknown model 'third'"):
         check_overrides("demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree)
+
+
+def test_a_sweep_of_any_command_writes_under_outputs() -> None:
+    for file in config_dir().glob("*.yaml"):
+        if "hydra" in (cfg := OmegaConf.load(file)):
+            assert str(OmegaConf.to_container(cfg.hydra)["sweep"]["dir"]).startswith("outputs/sweeps/"), file
 
 
 def test_the_same_words_give_equal_but_separate_configurations() -> None:

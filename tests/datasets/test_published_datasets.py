@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from helpers.h5_files import write_file
-from mme_vla.cli.exec_starts import main
+from mme_vla.cli.exec_starts import annotated_episodes, first_frames, main
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.exec_starts import annotated_episodes, first_frames
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
 from mme_vla.testing.small import small_policy

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mme_vla.cli.sample import EPISODES
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, RawEpisode, open_episode
-from mme_vla.data.sample import EPISODES
 
 
 def test_the_sample_holds_four_real_demonstrations() -> None:

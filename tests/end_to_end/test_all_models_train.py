@@ -36,6 +36,10 @@ SHORT_MEMORY = {
     "actions": ["memory.max_steps=8", "memory.max_video=4"],
     "learned_topk": ["memory.budget=48", "memory.pool=4"],
     "spacetime": ["memory.frames=3", "memory.stride=4", "memory.state_dim=8"],
+    "anchors": ["memory.spacing=4"],
+    "events": ["memory.budget=64"],
+    "pyramid": ["memory.budget=80"],
+    "keyframes": ["memory.budget=48", "memory.pool=8"],
 }
 
 

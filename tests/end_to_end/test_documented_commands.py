@@ -56,7 +56,7 @@ NOT_RUN = {
     r"mme-vla (convert|cache) |subgoal-build input=(path|datasets)": "needs a full dataset",
     r"--config-dir configs embodiment=two_arms": "needs a robot's dataset",
     r"mme-vla weights ": "needs released weights",
-    r"benchmarks/(gpu|episode_seeds)\.py": "measures for minutes",
+    r"benchmarks/(gpu|episode_seeds|nano_simplememvla)\.py": "measures for minutes",
 }
 """Pattern → why the commands that it matches are not run here."""
 

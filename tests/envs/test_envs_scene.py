@@ -16,9 +16,7 @@ from helpers.env_scenes import Scene, one_of_everything, recorded, replay, setup
 from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
 from mme_vla.envs.robot.robots import description
-from mme_vla.envs.scene.objects import (
-    build_disc,
-)
+from mme_vla.envs.scene.objects import build_disc
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 
 PICK = ("PickXtimes", 8)

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from mme_vla.envs import make_env
+from mme_vla.envs.base import Hold
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError
@@ -46,6 +47,7 @@ def same(one: Any, other: Any) -> bool:
 CASES = [
     ("VideoUnmaskSwap", "test", "joint_angle", [None] * 12, [None] * 8),
     ("PickXtimes", "twin", "multi_choice", [{"choice": "a", "point": [94, 110]}], [{"choice": "b"}, {"choice": "c"}]),
+    ("StopCube", "test", "joint_angle", [None] * 3 + [Hold(6)], [Hold(4), *[None] * 2]),
 ]
 
 

@@ -2,6 +2,7 @@
 
 import re
 import runpy
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from mme_vla.evaluation.rollouts import join, rollouts
 from mme_vla.policy.log_prob import SamplePath, log_prob, path_log_prob
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import REWARDS
+from mme_vla.types import Labels
 
 EXAMPLES = REPOSITORY / "examples" / "trajectories"
 JOBS = [Job("TwoChoices", "train", episode) for episode in range(4)]
@@ -54,6 +56,37 @@ def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choice
     batch = join([t.observations for t in trajectories if t.observations is not None])
     loss, _ = policy(batch)
     assert torch.isfinite(loss) and batch.history is not None and len(batch.history.mask) == len(JOBS)
+
+
+def test_rows_are_joined_with_their_weights_and_labels(policy: MMEPolicy) -> None:
+    one, two = (t.observations for t in rollouts(policy, two_choices, JOBS[:2], ("observations",)))
+    assert one is not None and two is not None
+    labelled = [
+        replace(one, weight=torch.tensor([0.5]), labels=Labels(grasp=torch.tensor([1.0]))),
+        replace(two, action_mask=None, labels=Labels(grasp=torch.tensor([2.0]))),
+    ]
+    both = join(labelled)
+    assert both.weight is not None and both.weight.tolist() == [0.5, 1.0]  # none counts as 1
+    assert both.labels["grasp"].tolist() == [1.0, 2.0]
+    assert both.action_mask is not None and both.action_mask.sum(1).tolist() == [1, 4]
+    with pytest.raises(UserError, match="1 of 2 batches to join have 'history'"):
+        join([one, replace(two, history=None)])
+    with pytest.raises(UserError, match="different labels"):
+        join([labelled[0], two])
+
+
+def test_an_episode_that_cannot_begin_is_a_trajectory_without_decisions(policy: MMEPolicy) -> None:
+    def make_env(task: str, split: str, episode: int, max_steps: int) -> Any:
+        if episode == 1:
+            raise RuntimeError("no place for the cube")
+        return two_choices(task, split, episode, max_steps)
+
+    trajectories = {t.job: t for t in rollouts(policy, make_env, JOBS[:3], ALL)}
+    assert set(trajectories) == set(JOBS[:3])
+    failed = trajectories[JOBS[1]]
+    assert failed.outcome == "error" and failed.error is not None and "no place for the cube" in failed.error
+    assert failed.chunks.shape == (0, 4, 10) and failed.total_reward == 0.0 and failed.observations is None
+    assert trajectories[JOBS[0]].error is None and len(trajectories[JOBS[0]].chunks) == 1
 
 
 def test_the_same_seed_repeats_a_rollout_and_another_does_not(policy: MMEPolicy) -> None:

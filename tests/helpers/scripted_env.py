@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.envs.base import Hold
+
 VIDEO = {"VideoUnmask": 21, "PatternLock": 5}
 """Frames of the conditioning video, by task."""
 SIZE = 64
@@ -17,24 +19,31 @@ class ScriptedEnv:
 
     It ends by success once the joints have travelled far enough, so the outcome depends on all actions.
 
+    It holds its joints when told to, and names a sub-task anew after every action.
+
     Attributes:
-        actions: all it was given. frames: all front images it showed.
+        actions: all it was given. held: control steps for which it held. frames: all front images it showed.
     """
 
     def __init__(self, task: str, episode: int, max_steps: int, travel: float, step_s: float, dies: str) -> None:
         self.task_name, self.episode, self.max_steps = task, episode, max_steps
         self.travel, self.step_s, self.dies = travel, step_s, dies
         self.actions: list[np.ndarray] = []
+        self.held = 0
         self.frames: list[np.ndarray] = []
         self.states: list[np.ndarray] = []
-        self.joints, self.gripper, self.path = np.zeros(7), 0.04, 0.0
+        self.joints: np.ndarray = np.zeros(7)
+        self.gripper, self.path = 0.04, 0.0
 
     def reset(self) -> tuple[dict[str, Any], dict[str, Any]]:
         count = VIDEO.get(self.task_name, 0) + 1
         return self._lists([self._frame() for _ in range(count)]), self._info("ongoing")
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray | Hold) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
         time.sleep(self.step_s)
+        if isinstance(action, Hold):
+            self.held += action.steps
+            return self._lists([self._frame() for _ in range(action.steps)]), 0.0, False, False, self._info("ongoing")
         self.actions.append(np.array(action))
         if self.dies and len(self.actions) == 20:
             self._die()

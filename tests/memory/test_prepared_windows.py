@@ -110,6 +110,7 @@ FULL = {
         model: {}
         for model in ("retrieval_modul", "moment_modul", "gist_modul", "learned_topk_modul", "spacetime_modul")
     },
+    **{model: {} for model in ("events_modul", "pyramid_modul", "keyframes_modul")},
 }
 """Windows that six chunks fill, where there is one."""
 

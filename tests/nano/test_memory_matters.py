@@ -10,6 +10,7 @@ from mme_vla.testing.small import BEYOND
 pytestmark = pytest.mark.slow
 
 GUESSING = 0.75
+LEARNING = [model for model in BEYOND if not model.startswith("anchors")]  # no square in the first frame and the last
 TOWER = {"depth": 1, "image_size": 16, "patch_size": 4, "width": 16, "mlp_dim": 16, "num_heads": 1}
 
 
@@ -27,7 +28,7 @@ def test_a_memory_learns_what_only_the_video_showed(learn):
     assert learn("framesamp_expert")["error"] < 0.5 * GUESSING
 
 
-@pytest.mark.parametrize("model", [*BEYOND, "actions_context", "spacetime_modul"])
+@pytest.mark.parametrize("model", [*LEARNING, "actions_context", "spacetime_modul"])
 def test_so_does_each_memory_beyond_the_paper(learn, model):
     assert learn(model)["error"] < 0.5 * GUESSING
 

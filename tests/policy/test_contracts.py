@@ -26,6 +26,8 @@ SIZES: dict[str, dict[str, Any]] = {
     "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "present": {"grid": 4},
     "learned_topk": {"budget": 32, "pool": 6},
     "spacetime": {"stride": 4}, "bank": {"budget": 16, "grid": 4, "moments": 4, "video": 2, "hidden": 32, "length": 3},
+    "anchors": {"spacing": 3}, "events": {"budget": 64, "stride": 4}, "pyramid": {"budget": 96, "strides": [1, 4]},
+    "keyframes": {"budget": 64, "every": 4, "pool": 8},
 }  # fmt: skip
 
 

@@ -28,14 +28,16 @@ def test_images_on_demand_are_all_that_an_arm_reads(name: str, word: str) -> Non
 def probe_both(folder: Path, **settings: object) -> Probe:
     policy = quick_policy("framesamp_modul").eval()
     recordings = made_up()
-    request = ProbePlan(["shuffle", "nodemo"], recordings[:1], recordings, JOBS, OfflineSettings(1, 2, 1, True, 2))
+    offline = OfflineSettings(1, 2, 1, True, 2)
+    request = ProbePlan(["shuffle", "nodemo"], recordings[:1], recordings, JOBS, offline, events=["pause:4"])
     settings_ = RolloutSettings(max_steps=24, flow_steps=2, workers=1, max_batch=1, **settings)
     return run_probe(policy, request, folder, FACTS, settings_, base=make_moving_env, show_progress=False)
 
 
 def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(tmp_path: Path) -> None:
     findings = probe_both(tmp_path)
-    assert {c.first for c in findings.comparisons} == {named("tiny", read_arm(w)) for w in ("shuffle", "nodemo")}
+    arms = {named("tiny", read_arm(w)) for w in ("shuffle", "nodemo")}
+    assert {c.first for c in findings.comparisons} == {*arms, "tiny · pause:4"}
     assert all(c.second == "tiny" and c.episodes == 2 for c in findings.comparisons)
     assert set(findings.findings.arms()) == {"shuffle", "nodemo"}
     page = findings.page.read_text()
@@ -43,7 +45,7 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(tmp_
         assert words in page
     assert "<script" not in page and 'src="http' not in page and 'href="http' not in page
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
-    assert len(before) == 4
+    assert len(before) == 5
     again = probe_both(tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == before
     assert again.findings == findings.findings

@@ -67,10 +67,7 @@ def test_prompt_state_is_normalised_before_it_is_saved() -> None:
 
 def test_prompt_takes_what_its_format_needs_and_ignores_the_remainder() -> None:
     unprompted, subgoal = processor(stats=None), processor(prompt="subgoal", stats=None)
-    assert torch.equal(
-        unprompted.prompt("press it", "put it down", np.zeros(8))[0],
-        unprompted.prompt("press it")[0],
-    )
+    assert torch.equal(unprompted.prompt("press it", "put it down", np.zeros(8))[0], unprompted.prompt("press it")[0])
     ids, mask = subgoal.prompt("press it", "put it down")
     assert "Current Subgoal: put it down" in subgoal.tokenizer.decode(ids[mask].tolist())
 

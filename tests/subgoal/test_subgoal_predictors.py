@@ -10,7 +10,7 @@ from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal import Memer, Oracle, QwenVL, build_predictor
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import VLM, Completion, Question
-from mme_vla.subgoal.models.tiny import save_tiny
+from mme_vla.subgoal.models.tiny import make_tiny
 
 pytest.importorskip("transformers", reason="needs the extra vlm")
 
@@ -189,7 +189,9 @@ def test_a_tiny_model_predicts_for_several_episodes(name, tiny):
 
 
 def test_a_model_loads_from_a_folder_and_a_missing_one_is_named(tiny, tmp_path):
-    loaded = VLM.load(str(save_tiny(tmp_path / "model")), device="cpu", dtype="float32")
+    for part in make_tiny():
+        part.save_pretrained(tmp_path / "model")
+    loaded = VLM.load(str(tmp_path / "model"), device="cpu", dtype="float32")
     question = Question("s", "<image>next?", [frames(1)[0]])
     assert loaded.generate([question], 8) == tiny.generate([question], 8)
     with pytest.raises(UserError, match="No Qwen3-VL model"):

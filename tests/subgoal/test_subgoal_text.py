@@ -7,10 +7,10 @@ import pytest
 
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until, merge_keyframes, recent_frames
 from mme_vla.subgoal.text import (
+    MEMER_SYSTEM,
     MalformedReply,
     mark_points,
     memer_reply,
-    memer_system,
     memer_user,
     numbered,
     parse_gemini,
@@ -60,7 +60,7 @@ def test_prompts_are_the_papers(figures, kind):
 def test_memer_prompts_are_the_papers(figures):
     system, user, reply = figures["memer"]
     goal = re.search(r"The task goal is: (.*)\n", user)[1]
-    assert memer_system() == system
+    assert system == MEMER_SYSTEM
     assert memer_user(goal, 4, 8, video=True) == user
     assert memer_reply("pick up the correct cube at <bbox> for the third time", [4]) == reply
 

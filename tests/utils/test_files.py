@@ -6,17 +6,15 @@ import signal
 import subprocess
 import sys
 import tracemalloc
-from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.utils import (
     SUMS,
     FolderLock,
-    append_lines,
     check_sums,
     inside,
     read_bytes,
@@ -24,7 +22,7 @@ from mme_vla.utils import (
     read_lines,
     read_text,
     safe_name,
-    to_dataclass,
+    to_line,
     write_atomically,
     write_json,
     write_sums,
@@ -62,48 +60,36 @@ def test_whatever_stands_in_a_files_place_is_refused_without_waiting(tmp_path: P
             read_text(tmp_path / name, limit=100)
 
 
-@dataclass(frozen=True)
-class Reading:
-    name: str
-    value: float | None
-    ages: list[int] = field(default_factory=list)
+def named(row: dict[str, Any]) -> dict[str, Any]:
+    require("name" in row, "there is no name")
+    return row
 
 
-def readings(path: Path) -> list[Reading]:
-    return read_lines(path, partial(to_dataclass, Reading), "readings")
-
-
-def test_appended_lines_are_read_back(tmp_path: Path) -> None:
-    file, values = tmp_path / "log.jsonl", [Reading("\u2028", 1.5, [3, 4]), Reading("b", None)]
-    for value in values:
-        append_lines(file, [asdict(value)])
-    assert readings(file) == values
+def test_lines_are_read_back(tmp_path: Path) -> None:
+    file, values = tmp_path / "log.jsonl", [{"name": "\u2028", "ages": [3, 4]}, {"name": "b", "value": None}]
+    file.write_text("".join(f"{to_line(value)}\n" for value in values))
+    assert read_lines(file, named) == values
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ('{"name"', "line 2 is not valid JSON"), ('{"name": "a"}', "line 2: .*missing value"),
-        ('{"name": "a", "value": 1, "x": 1}', "line 2: .*unknown x"),
-        ('{"name": {}, "value": 1}', "name={}: expected str"),
-        ('{"name": "a", "value": true}', "value=True: expected float"), ('{"name": "a", "value": NaN}', "NaN"),
-        ('{"name": "a", "value": 1, "ages": ["1"]}', r"ages=\['1'\]: expected list\[int\]"), ("[]", "an object"),
-        ('{"name": "a", "value": 1, "crc32": "0"}', "line 2 is not what was written"),
+        ('{"name"', "line 2 is not valid JSON"), ("{}", "line 2: there is no name"), ("[]", "an object"),
+        ('{"name": NaN}', "NaN"), ('{"name": "a", "crc32": "0"}', "line 2 is not what was written"),
     ],
 )  # fmt: skip
 def test_damaged_line_is_reported_with_its_number(tmp_path: Path, line: str, message: str) -> None:
     file = tmp_path / "log.jsonl"
     file.write_text(f'{{"name": "a", "value": 1}}\n{line}\n')
     with pytest.raises(UserError, match=message):
-        readings(file)
+        read_lines(file, named)
 
 
 def test_half_written_last_line_is_ignored_with_a_warning(tmp_path: Path) -> None:
     file = tmp_path / "log.jsonl"
-    append_lines(file, [asdict(Reading("a", 1.0)), asdict(Reading("b", 2.0))])
-    file.write_bytes(file.read_bytes()[:-2])
+    file.write_text(f"{to_line({'name': 'a'})}\n{to_line({'name': 'b'})[:-2]}")
     with pytest.warns(UserWarning, match="half-written"):
-        assert [reading.name for reading in readings(file)] == ["a"]
+        assert read_lines(file, named) == [{"name": "a"}]
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

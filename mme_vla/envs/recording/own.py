@@ -10,57 +10,76 @@ import numpy as np
 from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.envs.base import Environment, EpisodeEnv
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError
+from mme_vla.utils import write_atomically
 
 STATE, ACTION, IMAGES = "observation.state", "action", "observation.images."
 
 
 def record_own(
-    environment: Environment, specs: Sequence[EpisodeSpec], output: Path, fps: int = 20, max_steps: int = 1300
+    environment: Environment,
+    specs: Sequence[EpisodeSpec],
+    output: Path,
+    work: Path,
+    fps: int = 20,
+    max_steps: int = 1300,
 ) -> tuple[int, list[EpisodeSpec]]:
     """Demonstrate episodes into a new dataset; those that do not succeed are left out.
 
     The columns are `observation.images.<camera>`, `observation.state`, `action`, and `is_demo` for the frames of a
     conditioning video. `output` appears when it is whole.
 
+    Args:
+        work: folder that keeps each episode until then; those in it are not demonstrated again.
+
     Returns:
         Frames, and the episodes that did not succeed.
     """
-    require(not output.exists(), f"{output} exists already; choose another output, or remove it yourself.")
-    draft = output.with_name(output.name + ".recording")
+    draft, episodes = work / "dataset", {work / f"{spec.task}-{spec.episode}.npz": spec for spec in specs}
     shutil.rmtree(draft, ignore_errors=True)
     dataset: Any = None
     failures, frames = [], 0
     with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
-        for spec in specs:
-            rows, success = _demonstrated(environment, spec, max_steps)
-            if not success:
-                failures.append(spec)
-            else:
-                dataset = dataset or _create(rows[0], draft, fps)
-                for row in rows:
-                    dataset.add_frame(row)
-                dataset.save_episode()
-                frames += len(rows)
+        for path, spec in episodes.items():
+            if not path.is_file():
+                columns = _demonstrated(environment, spec, max_steps)
+                if columns is None:
+                    failures.append(spec)
+                else:
+                    with write_atomically(path) as temporary, temporary.open("wb") as file:
+                        np.savez_compressed(file, **columns)  # type: ignore[arg-type]
             advance(1)
-    if dataset is None:
-        raise UserError(f"None of {len(specs)} demonstrations ended with info['success']: nothing was written.")
-    dataset.finalize()
+        for path in filter(Path.is_file, episodes):
+            with np.load(path) as loaded:
+                columns = dict(loaded)
+            goal = str(columns.pop("task"))
+            rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+            dataset = dataset or _create(rows[0], draft, fps)
+            for row in rows:
+                dataset.add_frame({**row, "task": goal})
+            dataset.save_episode()
+            frames += len(rows)
+        if dataset is None:
+            raise UserError(f"None of {len(specs)} demonstrations ended with info['success']: nothing was written.")
+        dataset.finalize()
     draft.rename(output)
     return frames, failures
 
 
-def _demonstrated(environment: Environment, spec: EpisodeSpec, max_steps: int) -> tuple[list[dict[str, Any]], bool]:
-    """Rows of an episode, and whether it succeeded."""
+def _demonstrated(environment: Environment, spec: EpisodeSpec, max_steps: int) -> dict[str, np.ndarray] | None:
+    """The columns of an episode [frames, …] and its `task`; None where it did not succeed."""
     env = EpisodeEnv(environment, environment.make(spec), spec, max_steps)
     try:
         rows = []
         for observation, action, visible in env.demonstration():
             images = {f"{IMAGES}{name}": np.asarray(image) for name, image in observation.items() if name != "state"}
             state = np.asarray(observation["state"], np.float32)
-            numbers = {STATE: state, ACTION: np.asarray(action, np.float32), "is_demo": np.array([visible])}
-            rows.append({**images, **numbers, "task": env.goal})
-        return rows, env.success
+            rows.append(
+                {**images, STATE: state, ACTION: np.asarray(action, np.float32), "is_demo": np.array([visible])}
+            )
+        if not env.success:
+            return None
+        return {name: np.stack([row[name] for row in rows]) for name in rows[0]} | {"task": np.array(env.goal)}
     finally:
         env.close()
 

@@ -100,7 +100,8 @@ class Arm:
         start = self._padded(qpos)
         random = np.random.default_rng(0)
         for _ in range(1 + _RESTARTS):
-            arm = self._wrapped(self._iterate(target, start))
+            arm = self._iterate(target, start)
+            arm -= 2 * np.pi * np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
             match = sapien.Pose(self.transform(arm))
             if self.within_limits(arm) and pose_distance(match, sapien.Pose(target)) < IK_TOLERANCE:
                 return arm
@@ -129,10 +130,6 @@ class Arm:
         full = np.zeros(self._model.nq)
         full[:ARM_JOINTS] = np.asarray(qpos, np.float64)[:ARM_JOINTS]
         return full
-
-    def _wrapped(self, arm: np.ndarray) -> np.ndarray:
-        revolutions = np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
-        return arm - 2 * np.pi * revolutions
 
 
 def pose_distance(a: sapien.Pose, b: sapien.Pose) -> float:

@@ -31,11 +31,7 @@ logging.getLogger("toppra").setLevel(logging.ERROR)
 
 
 def plan_screw(
-    arm: Arm,
-    qpos: np.ndarray,
-    target_pose: sapien.Pose,
-    velocity_limit: float = 0.9,
-    acceleration_limit: float = 0.9,
+    arm: Arm, qpos: np.ndarray, target_pose: sapien.Pose, velocity_limit: float = 0.9, acceleration_limit: float = 0.9
 ) -> np.ndarray | None:
     """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
 
@@ -44,8 +40,8 @@ def plan_screw(
 
     Args:
         arm: the kinematic model.
-        qpos: present joint angles, [7] or longer. The path is kept in their precision, as `mplib` keeps it: the official
-            gripper demonstrations have single precision, those of the stick double.
+        qpos: present joint angles, [7] or longer. The path keeps their precision, as in `mplib`: single in official
+            demonstrations of the gripper, double in those of the stick.
         target_pose: of the tool centre point in the world.
         velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 

@@ -52,9 +52,7 @@ class WristCamPanda(PandaWristCam):
     def urdf_path(self) -> str:
         return description(PandaWristCam.urdf_path, visible=self.scene.can_render())
 
-    @property
-    def _sensor_configs(self) -> list[CameraConfig]:
-        return _camera(self)
+    _sensor_configs = property(_camera)
 
 
 @register_agent()
@@ -67,9 +65,7 @@ class StickPanda(PandaStick):
     def urdf_path(self) -> str:
         return description(PandaStick.urdf_path, mount_from=PandaWristCam.urdf_path, visible=self.scene.can_render())
 
-    @property
-    def _sensor_configs(self) -> list[CameraConfig]:
-        return _camera(self)
+    _sensor_configs = property(_camera)
 
 
 @cache

@@ -77,18 +77,15 @@ class Peg(Thing):
         return pose_of(self.articulation.root)
 
     def move_to(self, pose: sapien.Pose) -> None:
-        """Teleport the peg, at rest."""
         self.articulation.set_pose(pose)
         self.articulation.set_root_linear_velocity(np.zeros((1, 3), np.float32))
         self.articulation.set_root_angular_velocity(np.zeros((1, 3), np.float32))
 
     def displace(self, pose: sapien.Pose) -> None:
-        """Teleport the peg in the midst of its motion: it keeps its velocity."""
         self.articulation.set_pose(pose)
 
     @property
     def segmentation_ids(self) -> list[int]:
-        """Ids of the pixels of both halves."""
         return self.head.segmentation_ids + self.tail.segmentation_ids
 
 

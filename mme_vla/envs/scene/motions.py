@@ -53,7 +53,9 @@ class Appear:
 
 
 class Cover:
-    """Containers are away for half of a window and then stand over what lay open."""
+    """Containers are away for half of a window and then stand over what lay open. active: they are away."""
+
+    active = False
 
     def __init__(self, containers: Sequence[Thing], group: int | None = None) -> None:
         """`group`: park each container at a place of its own (`parked`); None: all at one."""
@@ -64,12 +66,13 @@ class Cover:
 
     def apply(self, k: int) -> None:
         """Move the containers for the step before which `k` steps were done."""
+        self.active = k < UNCOVERED_STEPS
         for part in self._parts:
             part.apply(k)
 
 
 class Swap:
-    """Two objects change places on arcs around each other while all others stand still.
+    """Two objects change places on arcs around each other while all others stand still. active: they move.
 
     Args:
         initiator: one of the two; the other is `partner`, by default the nearest one when the swap begins.
@@ -78,6 +81,8 @@ class Swap:
         lane: how far the two evade each other sideways, metres.
         steps: how long it takes.
     """
+
+    active = False
 
     def __init__(
         self,
@@ -99,10 +104,15 @@ class Swap:
 
     def apply(self, k: int) -> None:
         """Move the objects for the step before which `k` steps were done."""
-        if not self.start <= k <= self.end:
+        self.active = self.start <= k <= self.end
+        if not self.active:
             return
         if k == self.start:
-            self._begin()
+            self._poses = {thing: thing.pose for thing in self._group}
+            if self.partner is None:
+                origin = self.initiator.position
+                others = [thing for thing in self._group if thing is not self.initiator]
+                self.partner = min(others, key=lambda thing: distance_xy(thing.position, origin))
         assert self.partner is not None
         a, b = self._poses[self.initiator], self._poses[self.partner]
         alpha = smoothstep((k - self.start) / self.steps)
@@ -118,13 +128,6 @@ class Swap:
                 thing.move_to(sapien.Pose([*(b.p[:2] - arc), b.p[2]], blend(b.q, a.q, alpha)))
             else:
                 thing.move_to(pose)
-
-    def _begin(self) -> None:
-        self._poses = {thing: thing.pose for thing in self._group}
-        if self.partner is None:
-            origin = self.initiator.position
-            others = [thing for thing in self._group if thing is not self.initiator]
-            self.partner = min(others, key=lambda thing: distance_xy(thing.position, origin))
 
 
 def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
@@ -143,6 +146,11 @@ def planned_swaps(
 ) -> list[Swap]:
     """One swap after another, the first at step `start`; both objects of each are given by their indices."""
     return [Swap(group[a], group, start + i * steps, partner=group[b], steps=steps) for i, (a, b) in enumerate(pairs)]
+
+
+def active_motions(motions: "Sequence[Cover | Swap | Highlight]") -> set[str]:
+    """Names of the motions that take place, by their kind and number: `swap 0`."""
+    return {f"{type(motion).__name__.lower()} {i}" for i, motion in enumerate(motions) if motion.active}
 
 
 class Hide:
@@ -164,8 +172,9 @@ class Hide:
 
 
 class Highlight:
-    """A white disc under an object from one step to another, both included."""
+    """A white disc under an object from one step to another, both included. active: it is visible."""
 
+    active = False
     DEPTH = 0.01
     """How far below the object's origin the disc lies, metres."""
 
@@ -174,7 +183,8 @@ class Highlight:
 
     def apply(self, k: int) -> None:
         """Move the disc for the step before which `k` steps were done."""
-        if self._start <= k <= self._end:
+        self.active = self._start <= k <= self._end
+        if self.active:
             below = self._thing.position - [0, 0, self.DEPTH]
             self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         else:

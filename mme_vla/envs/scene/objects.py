@@ -168,13 +168,10 @@ class Board(Thing):
     """A low square frame on the table; things thrown into its hole cannot be seen."""
 
 
-def _rgb(colour: str | RGB) -> RGB:
-    return COLOURS[colour] if isinstance(colour, str) else colour
-
-
 def build_cube(env: "Stage", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:
     """A cube lying on the table."""
-    actor = Shapes(env).solid_box([half_size] * 3, _rgb(colour)).build(name, at(xy, half_size, yaw))
+    rgb = COLOURS[colour] if isinstance(colour, str) else colour
+    actor = Shapes(env).solid_box([half_size] * 3, rgb).build(name, at(xy, half_size, yaw))
     return Cube(name, actor, colour, half_size)
 
 
@@ -190,13 +187,7 @@ def build_moving_cube(env: "Stage", name: str, colour: RGB, xy: XY, z: float) ->
 
 
 def build_disc(
-    env: "Stage",
-    name: str,
-    radius: float,
-    thickness: float,
-    colour: str,
-    xy: XY,
-    z: float | None = None,
+    env: "Stage", name: str, radius: float, thickness: float, colour: str, xy: XY, z: float | None = None
 ) -> Disc:
     """A target without collision: five rings, alternately of a colour of `TARGET_COLOURS` and white.
 

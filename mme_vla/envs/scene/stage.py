@@ -54,10 +54,7 @@ class Stage(BaseEnv):
         self.stored_qpos: np.ndarray | None = None
         """Joint angles [7] at the end of the stick's first approach, where its execution begins."""
         super().__init__(
-            *args,
-            robot_uids=robot_uids or (STICK if self.stick else WRISTCAM),
-            control_mode=control_mode,
-            **kwargs,
+            *args, robot_uids=robot_uids or (STICK if self.stick else WRISTCAM), control_mode=control_mode, **kwargs
         )
 
     # The scene ----------------------------------------------------------------------------------------------------

@@ -31,7 +31,8 @@ class Thing:
         self.name = name
         self.entity = entity
         self._may_sink = isinstance(entity, Actor)
-        self._initial = self.pose
+        self.initial_pose = self.pose
+        """Where the object was put when the scene was built; `restore` brings it back there."""
 
     @property
     def pose(self) -> sapien.Pose:
@@ -42,11 +43,6 @@ class Thing:
     def position(self) -> np.ndarray:
         """Origin in the world [3], metres."""
         return np.asarray(self.pose.p)
-
-    @property
-    def initial_pose(self) -> sapien.Pose:
-        """Where the object was put when the scene was built; `restore` brings it back there."""
-        return self._initial
 
     def move_to(self, pose: sapien.Pose) -> None:
         """Teleport the object, at rest."""
@@ -76,12 +72,12 @@ class Thing:
 
     def set_home(self, pose: sapien.Pose) -> None:
         """Make `pose` the place the object is restored to, and put it there."""
-        self._initial = pose
+        self.initial_pose = pose
         self.move_to(pose)
 
     def restore(self) -> None:
         """Put the object where it was when the scene was built."""
-        self.move_to(self._initial)
+        self.move_to(self.initial_pose)
 
     @property
     def segmentation_ids(self) -> list[int]:

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from itertools import islice
 from typing import Any
 
@@ -16,7 +16,7 @@ from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import add_button, press
+from mme_vla.envs.tasks.families.stages import add_button, choices_made, press
 
 # Both bounds belong to the range.
 AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
@@ -190,6 +190,9 @@ class BinFill(Task):
             choice="b",
             operation="how many",
         )
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        return choices_made(ended, "b", video=False)
 
     def choices(self) -> list[Choice]:
         return [

@@ -216,9 +216,7 @@ class MoveCube(Task):
                 lambda demo, _: demo.hook(self.cube, self.target, self._side()),
             ),
             Choice(
-                "c",
-                "close gripper and push the cube to the target",
-                lambda demo, _: demo.push(self.cube, self.target),
+                "c", "close gripper and push the cube to the target", lambda demo, _: demo.push(self.cube, self.target)
             ),
             Choice("d", "pick up the cube", lambda demo, _: demo.pick(self.cube)),
             Choice("e", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)),

@@ -1,6 +1,8 @@
 """PickHighlight (Reference): some cubes are briefly underlaid with white; press the button, then pick up just those."""
 
-from mme_vla.envs.scene.motions import Cue, Highlight, under
+from collections.abc import Collection, Mapping
+
+from mme_vla.envs.scene.motions import Cue, Highlight, active_motions, under
 from mme_vla.envs.scene.objects import COLOURS, RGB, Cube, H, build_highlight
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up
@@ -60,6 +62,9 @@ class PickHighlight(Task):
     def before_physics(self, k: int) -> None:
         for highlight in self.highlights:
             highlight.apply(k)
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        return active_motions(self.highlights)
 
     def failure(self) -> bool:
         self.picked.update(cube for cube in self.goal_cubes if picked_up(self, cube))

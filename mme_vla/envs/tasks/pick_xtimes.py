@@ -1,5 +1,7 @@
 """PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
 
+from collections.abc import Collection, Mapping
+
 from mme_vla.envs.scene.motions import Cue, row, tally
 from mme_vla.envs.scene.objects import Cube, H
 from mme_vla.envs.scene.placement import Draws, Region
@@ -13,6 +15,7 @@ from mme_vla.envs.tasks.families.stages import (
     add_distractors,
     add_target,
     check_colour,
+    choices_made,
     cube_names,
     pick,
     press,
@@ -93,6 +96,9 @@ class PickXtimes(Task):
     def _mistaken(self) -> str:
         """Stopping too early is a count forgotten; which cube, the goal says."""
         return "how many" if pressed(self.button) else ""
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        return choices_made(ended, "b", video=False)
 
     def choices(self) -> list[Choice]:
         return [

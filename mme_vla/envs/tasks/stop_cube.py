@@ -1,6 +1,7 @@
 """StopCube (Counting): a cube goes back and forth over a target; stop it there on the right visit."""
 
 import math
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -96,6 +97,10 @@ class StopCube(Task):
         if self.stopped_at is not None:
             return not (self._on_target() and self._in_time())
         return self.steps_done > self.deadline
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        over = self.stopped_at is None and self._on_target()
+        return {f"visit {self.steps_done // self.interval}"} if over else ()
 
     def checkpoints(self) -> list[int]:
         """Steps until which the arm waits: every 100th, then the one at which to press."""

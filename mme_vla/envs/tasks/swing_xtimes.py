@@ -1,5 +1,7 @@
 """SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
 
+from collections.abc import Collection, Mapping
+
 from mme_vla.envs.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
 from mme_vla.envs.scene.objects import Cube, Disc, H
 from mme_vla.envs.scene.placement import Avoid, Draws, Region
@@ -14,6 +16,7 @@ from mme_vla.envs.tasks.families.stages import (
     add_distractors,
     add_target,
     check_colour,
+    choices_made,
     cube_names,
     pick,
     press,
@@ -148,6 +151,9 @@ class SwingXtimes(Task):
 
     def _wrong_cube(self) -> bool:
         return any_picked_up(self, [cube for cube in (*self.cubes, *self.distractors) if cube is not self.cube])
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        return choices_made(ended, "b", video=False)
 
     def choices(self) -> list[Choice]:
         targets = [self.right, self.left]

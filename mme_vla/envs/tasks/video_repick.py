@@ -1,20 +1,36 @@
 """VideoRepick (Reference): the video picks up a cube; pick the same one up again, wherever it is now."""
 
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
-from mme_vla.envs.scene.motions import SWAP_STEPS, Cue, Swap, planned_swaps, row, sequential_swaps, tally, under
-from mme_vla.envs.scene.objects import COLOURS, RGB, Cube
-from mme_vla.envs.scene.placement import (
-    ANCHOR_HALF,
-    Draws,
-    Region,
-    rotated_anchors,
+from mme_vla.envs.scene.motions import (
+    SWAP_STEPS,
+    Cue,
+    Swap,
+    active_motions,
+    planned_swaps,
+    row,
+    sequential_swaps,
+    tally,
+    under,
 )
+from mme_vla.envs.scene.objects import COLOURS, RGB, Cube
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Draws, Region, rotated_anchors
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, pressed
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stages import add_button, add_cube, delay, end_video, go_home, pick, press, wait
+from mme_vla.envs.tasks.families.stages import (
+    add_button,
+    add_cube,
+    choices_made,
+    delay,
+    end_video,
+    go_home,
+    pick,
+    press,
+    wait,
+)
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -114,6 +130,10 @@ class VideoRepick(Task):
             return sum(step.choice == "b" and not step.video for step in self.progress.to_come)
 
         return [under(self.cube), *tally(row(self.repetitions), left)]
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        shown = choices_made(ended, "a", video=True) | choices_made(ended, "b", video=False)
+        return shown | active_motions(self.swaps)
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules belong to the stages."""

@@ -196,7 +196,9 @@ class VecEnv:
                     replies.append(reply)
             if replies or not self.busy or time.monotonic() >= until:
                 return sorted(replies, key=lambda reply: reply.worker)
-            self._sleep(until)
+            running = [state for state in self._workers if state.running]
+            seconds = min([until, *(state.deadline for state in running)]) - time.monotonic()
+            wait([state.connection for state in running], timeout=max(0.0, min(seconds, 60.0)))
 
     def close(self) -> None:
         """Stop all workers; closing twice is harmless."""
@@ -286,11 +288,6 @@ class VecEnv:
         protocol.end(old.process)
         self._workers[index] = self._spawn()
         return Reply.of_failure(index, old.begun, old.resetting, kind, message)
-
-    def _sleep(self, until: float) -> None:
-        running = [state for state in self._workers if state.running]
-        until = min([until, *(state.deadline for state in running)])
-        wait([state.connection for state in running], timeout=max(0.0, min(until - time.monotonic(), 60.0)))
 
     def _require_open(self) -> None:
         require(not self._closed, "The environments are closed; make new ones.")

@@ -10,7 +10,7 @@ from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.memory_image import memory_sheet
-from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.data.statistics import compute_norm_stats, normalised_states
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.memory.base import Memory, make_scorer
@@ -181,6 +181,8 @@ def selection_sheets(
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
     history, patches = OnlineHistory(memory.storage, make_scorer(memory), start), memory.storage.grid**2
+    motion = normalised_states(source.states(episode, 0, length))
+    history.motion, history.state_width = motion.__getitem__, motion.shape[1]
     n_observed = 0
     for step in range(start, length, every):
         part = frames[n_observed : step + 1]

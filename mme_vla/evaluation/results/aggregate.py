@@ -179,6 +179,7 @@ class Method:
     """All runs of one model by one recipe, with the figures of every scope in `figures[kind][name]`.
 
     recipe, data: digests of what its trainings share; None where records do not name them.
+    event: what happened in the rollouts; None for the plain ones.
     repeated, flipped: see `Comparison`.
     """
 
@@ -191,6 +192,7 @@ class Method:
     composition: str | None = None
     recipe: str | None = None
     data: str | None = None
+    event: str | None = None
     figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
     repeated: int = 0
     flipped: int = 0
@@ -268,7 +270,8 @@ def aggregate(
     for key, members in by_run(counted).items():
         run = Run(key, {record.key: record for record in members}, protocol)
         trained = (None, None) if key.training is None else (key.training.recipe, key.training.data)
-        groups.setdefault((key.model, key.subgoal, key.memory_budget, key.composition, *trained), []).append(run)
+        group = key.model, key.subgoal, key.memory_budget, key.composition, *trained, key.event
+        groups.setdefault(group, []).append(run)
     methods = [_method(runs, protocol, *group) for group, runs in groups.items()]
     repeats = repeated_episodes(records)
     for method in methods:
@@ -321,13 +324,15 @@ def _method(
     composition: str | None,
     recipe: str | None,
     data: str | None,
+    event: str | None,
 ) -> Method:
-    papers = budget in (None, DEFAULT_BUDGET) and not any(is_other(run.key.split) for run in runs)
+    papers = event is None and budget in (None, DEFAULT_BUDGET) and not any(is_other(run.key.split) for run in runs)
     known = paper.paper_method(model, subgoal) if papers else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
+    label = label if event is None else f"{label} · {event}"
     runs = sorted(runs, key=lambda run: (_seed(run), str(run.key.checkpoint).zfill(12), run.key.model_seed))
-    method = Method(label, model, subgoal, budget, runs, known, composition, recipe, data)
+    method = Method(label, model, subgoal, budget, runs, known, composition, recipe, data, event)
     for scope in scopes(protocol):
         reported = _reported(known, scope, protocol)
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)

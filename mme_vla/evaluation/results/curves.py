@@ -1,25 +1,26 @@
 """A curve instead of a point: success over how far a dial of `split=stress:…` is turned; the test split is its zero."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from mme_vla.envs.metadata import BASE, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
 from mme_vla.errors import require
-from mme_vla.evaluation.records import EpisodeRecord, merge
+from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Interval, Results, wilson
 from mme_vla.evaluation.results.plots import COLOURS, figure, svg
-from mme_vla.evaluation.results.tables import Table, task_table
+from mme_vla.evaluation.results.tables import Table, task_tables
 
 
 @dataclass(frozen=True)
 class Point:
     """Success of a model on a task at one place of a dial. interval: Wilson's, over distinct episodes; in percent."""
 
-    turned: int
+    turned: float
     won: int
     episodes: int
     interval: Interval
@@ -33,24 +34,48 @@ class Point:
 Curves = dict[tuple[str, str, str], list[Point]]  # (model, task, dial) → points, ascending
 
 
+class Place(NamedTuple):
+    """Where a record lies on a dial: the run at the dial's zero, the dial, how far it is turned, and its zero."""
+
+    run: RunKey
+    dial: str
+    turned: float
+    zero: float = 0
+
+
 def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
-    """Success over every dial that records were made with; records of the test split are at its zero.
+    """Success over every dial that records were made with; records of the test split are at its zero."""
+
+    def place(record: EpisodeRecord) -> Place | None:
+        variant = read_variant(record.split)
+        if variant is None or not variant.dial:
+            return None
+        return Place(record.run._replace(split=BASE), variant.dial, variant.turned)
+
+    curves = curves_of(merge(records, conflicts), place, confidence)
+    require(curves, "None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
+    return curves
+
+
+def curves_of(
+    records: Sequence[EpisodeRecord], place: Callable[[EpisodeRecord], Place | None], confidence: float = 0.95
+) -> Curves:
+    """Success over every dial.
 
     A point counts the episodes that the model has at every place of the dial, so that one curve is of the same scenes.
+
+    records: merged. place: where a record lies; None for a record that lies on none, or at the zero.
     """
-    groups: dict[tuple[str, str, str], dict[int, list[EpisodeRecord]]] = {}
-    merged = merge(records, conflicts)
-    for record in merged:
-        variant = read_variant(record.split)
-        if variant is not None and variant.dial:
-            at = (str(record.run._replace(split=BASE)), record.task, variant.dial)
-            groups.setdefault(at, {}).setdefault(variant.turned, []).append(record)
-    require(groups, "None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
+    groups: dict[tuple[str, str, str, float], dict[float, list[EpisodeRecord]]] = {}
+    for record in records:
+        if (at := place(record)) is not None:
+            group = groups.setdefault((str(at.run), record.task, at.dial, at.zero), {})
+            group.setdefault(at.turned, []).append(record)
     curves: Curves = {}
-    for (run, task, dial), places in groups.items():
-        baseline = [r for r in merged if r.split == BASE and r.task == task and str(r.run) == run]
-        if baseline and 0 not in places:
-            places[0] = baseline
+    for (run, task, dial, zero), places in groups.items():
+        baseline = [r for r in records if r.task == task and str(r.run) == run]
+        if baseline and zero not in places:
+            places[zero] = baseline
         common = set.intersection(*({r.episode for r in there} for there in places.values()))
         curves[run, task, dial] = [
             _point(turned, [r for r in there if r.episode in common], confidence)
@@ -60,23 +85,23 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
     return {name: points for name, points in curves.items() if points}
 
 
-def _point(turned: int, records: Sequence[EpisodeRecord], confidence: float) -> Point:
+def _point(turned: float, records: Sequence[EpisodeRecord], confidence: float) -> Point:
     won = sum(record.success for record in records)
     low, high = wilson(won / len(records), len(records), confidence)
     return Point(turned, won, len(records), Interval(100 * low, 100 * high))
 
 
-def stress_table(curves: Curves) -> Table:
+def stress_table(curves: Curves, title: str = "Success over the dials") -> Table:
     """Every point, a row each."""
     rows = []
     for (run, task, dial), points in sorted(curves.items()):
         for p in points:
             interval = f"[{p.interval.low:.1f}, {p.interval.high:.1f}]"
-            rows.append([run, task, dial, str(p.turned), str(p.episodes), f"{p.rate:.1f}", interval])
-    return Table("Success over the dials", ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
+            rows.append([run, task, dial, f"{p.turned:g}", str(p.episodes), f"{p.rate:.1f}", interval])
+    return Table(title, ["run", "task", "dial", "at", "episodes", "success (%)", "interval"], rows)
 
 
-def stress_figures(curves: Curves) -> dict[str, str]:
+def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> dict[str, str]:
     """For each task and dial a curve of every run, as SVG."""
     figures = {}
     for task, dial in dict.fromkeys((task, dial) for _, task, dial in sorted(curves)):
@@ -88,7 +113,7 @@ def stress_figures(curves: Curves) -> dict[str, str]:
                 above = [max(p.interval.high - p.rate, 0) for p in points]
                 axes.errorbar([p.turned for p in points], rates, [below, above], fmt="-o", ms=5, capsize=3,
                               color=COLOURS[i % len(COLOURS)], label=run)  # fmt: skip
-            axes.set_xlabel(f"{dial}: more than in the benchmark")
+            axes.set_xlabel(f"{dial}: {unit}")
             axes.set_ylabel("success (%)")
             axes.set_ylim(0, 100)
             axes.legend(fontsize=8)
@@ -112,12 +137,7 @@ def process_of(record: EpisodeRecord) -> ProcessScore | None:
 def process_tables(results: Results) -> list[Table]:
     """Where the chains broke, a table of every method that has scores, over all its runs."""
     columns = ["", "episodes", "progress (%)", "success", *OPERATIONS, MOTION, "stuck"]
-    tables = []
-    for method in results.methods:
-        records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
-        title = f"{method.label}: where the chain broke"
-        tables += task_table(title, columns, records, results.protocol.tasks, _row)
-    return tables
+    return task_tables(results, EXTRA, "where the chain broke", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:

@@ -28,17 +28,23 @@ class Table:
     strong: set[int] = field(default_factory=set)
 
 
-def task_table(
+def task_tables(
+    results: Results,
+    key: str,
     title: str,
     columns: Sequence[str],
-    records: Sequence[EpisodeRecord],
-    tasks: Sequence[str],
     row: Callable[[str, Sequence[EpisodeRecord]], list[str]],
 ) -> list[Table]:
-    """One table with a row for each task that has records, and one for all of them; none without records."""
-    by_task = {task: [record for record in records if record.task == task] for task in tasks}
-    rows = [row(task, members) for task, members in by_task.items() if members]
-    return [Table(title, columns, [*rows, row("all", records)], {len(rows)}, {len(rows)})] if records else []
+    """A table of every method whose records have `extra[key]`: a row for each task that has any, and one for all."""
+    tables = []
+    for method in results.methods:
+        records = [record for run in method.runs for record in run.records.values() if key in record.extra]
+        by_task = {task: [r for r in records if r.task == task] for task in results.protocol.tasks}
+        rows = [row(task, members) for task, members in by_task.items() if members]
+        if records:
+            rows.append(row("all", records))
+            tables.append(Table(f"{method.label}: {title}", columns, rows, {len(rows) - 1}, {len(rows) - 1}))
+    return tables
 
 
 def show(figure: Figure, short: bool = False) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state, choice_row
+from mme_vla.envs.base import Hold
 from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
@@ -25,8 +26,9 @@ from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
 OPTIONS = "available_multi_choices"
+SUBGOAL = "simple_subgoal_online"
 REPORTED = (
-    "status", "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "error_message", "exception_type",
+    "status", "task_goal", SUBGOAL, "grounded_subgoal_online", "error_message", "exception_type",
     OPTIONS,
 )  # fmt: skip
 """What is passed on of the environment's info."""
@@ -96,6 +98,8 @@ class ChunkEnv:
         self._simulating = self._rendered = 0.0
         self._steps = self._returned = 0
         self._pose: np.ndarray | None = None
+        self._last: np.ndarray | None = None
+        self._subgoal, self._n_subgoals = "", 0
         with self._simulation():
             self._env = make()
         self._clock.watch(self._env)
@@ -111,6 +115,7 @@ class ChunkEnv:
         frames = _Frames(self._robot)
         count = frames.add(observation)
         self._note_pose(observation)
+        self._note_subgoal(info)
         self._draw(frames, count, demo=count - 1)
         self._returned = frames.leave(draw, 0)
         return frames.observation(), self._report(info)
@@ -118,24 +123,26 @@ class ChunkEnv:
     def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute actions one after the other until they, or the episode, are over.
 
-        command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that are
-        requested, where it is not all: frames are counted from the reset on, and the newest is the last.
+        command: `actions` [n, w], or `hold`, the control steps for which the robot stays where it is; `subgoal`, the
+        text that is in the video meanwhile; `draw`, the images that are requested, where it is not all: frames are
+        counted from the reset on, and the newest is the last.
 
         Returns:
             The frames of the executed actions, the sum of their rewards, terminated, truncated, and the report with
-            `executed`, the number of actions, and `steps`, that of frames.
+            `executed`, the number of actions, and `steps`, that of frames. After `hold` no action counts as executed,
+            and `held` is the action [w] that keeps the robot there, None before the first one.
         """
+        if "hold" in command:
+            self._max_steps += command["hold"]
         frames, executed, n_frames, total_reward = _Frames(self._robot), 0, 0, 0.0
         terminated = truncated = False
         info: dict[str, Any] = {}
         draw: RenderRequest | None = command.get("draw")
-        actions = np.asarray(command["actions"])
+        actions = [Hold(command["hold"])] if "hold" in command else np.asarray(command["actions"])
         for number, action in enumerate(actions, 1):
             self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
             with self._simulation():
-                observation, reward, ended, cut, info = self._env.step(
-                    benchmark_action(self._robot.action, action, self._stick, self._pose)
-                )
+                observation, reward, ended, cut, info = self._env.step(self._command(action))
             terminated, truncated = bool(ended), bool(cut)
             total_reward += float(reward)
             if info.get("status") == "error":
@@ -143,10 +150,11 @@ class ChunkEnv:
                 if _is_unreachable(observation, info):
                     info = {**info, "status": "fail"}
                 break
-            executed += 1
-            self._executed += 1
+            executed += not isinstance(action, Hold)
+            self._executed += not isinstance(action, Hold)
             count = frames.add(observation)
             self._note_pose(observation)
+            self._note_subgoal(info)
             n_frames += count
             self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could continue for ever
             self._draw(frames, count, caption=command.get("subgoal"))
@@ -157,6 +165,8 @@ class ChunkEnv:
                 break
         self._returned = frames.leave(draw, self._returned)
         report = self._report(info) | {"executed": executed, "steps": n_frames}
+        if "hold" in command:
+            report["held"] = self._held()
         if terminated or truncated:
             report |= self._finish_video(report)
         return frames.observation(), total_reward, terminated, truncated, report
@@ -166,6 +176,29 @@ class ChunkEnv:
         if self._video is not None:
             self._video.discard()
         self._env.close()
+
+    def _command(self, action: "np.ndarray | Hold") -> Any:
+        """What the environment takes for an action [w] of the policy."""
+        if isinstance(action, Hold):
+            return action
+        self._last = action
+        return benchmark_action(self._robot.action, action, self._stick, self._pose)
+
+    def _held(self) -> np.ndarray | None:
+        """The policy's action that keeps the robot where it is."""
+        if hasattr(self._env, "hold_action"):
+            return np.asarray(self._env.hold_action, np.float32)
+        if self._last is None:
+            return None
+        row = self._last.copy()
+        row[list(self._robot.action.of_pose)] = 0
+        return row
+
+    def _note_subgoal(self, info: dict[str, Any]) -> None:
+        """Count the sub-tasks of an environment that only names them."""
+        text = info.get(SUBGOAL) or self._subgoal
+        self._n_subgoals += text != self._subgoal
+        self._subgoal = text
 
     def _note_pose(self, observation: dict[str, list[Any]]) -> None:
         if not self._robot.action.of_pose:
@@ -191,9 +224,11 @@ class ChunkEnv:
 
     def _report(self, info: dict[str, Any]) -> dict[str, Any]:
         report = {key: info[key] for key in REPORTED if key in info}
-        progress = getattr(getattr(self._env, "task", None), "progress", None)
+        progress, subtask = getattr(getattr(self._env, "task", None), "progress", None), self._n_subgoals
         if isinstance(progress, Progress):
-            report["process"] = process_score(progress, str(report.get("status"))).to_dict()
+            process = process_score(progress, str(report.get("status")))
+            report["process"], subtask = process.to_dict(), min(process.done + 1, process.of)
+        report["subtask"] = subtask  # of the execution, from 1; 0 where the environment tells none
         if (began := getattr(self._env, "began", None)) is not None:
             report["began"] = began
         if self._oracle and report.get("status") == "ongoing":

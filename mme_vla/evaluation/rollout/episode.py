@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
 from mme_vla.evaluation.rollout.environment import OPTIONS, Observation
+from mme_vla.evaluation.rollout.events import Event, EventCourse, PlacedEvent
 from mme_vla.evaluation.rollout.subgoals import SubgoalTrace
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
@@ -30,7 +32,7 @@ class RunningEpisode:
     Frames arrive all at once and are taken into memory in pieces (`read`), so that the hundreds of a conditioning
     video do not keep other episodes waiting.
 
-    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
+    subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals. events: what happens to it.
     """
 
     def __init__(
@@ -41,10 +43,14 @@ class RunningEpisode:
         subgoals: SubgoalPredictor | None = None,
         piece: int = 32,
         trace: SubgoalTrace | None = None,
+        events: Sequence[PlacedEvent] = (),
     ) -> None:
         self._policy, self._subgoals, self._piece = policy, subgoals, piece
         self.job, self.trace = job, trace
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
+        self.events = EventCourse(events)
+        self._shown = np.zeros(0, np.int64)  # The environment's frames that the policy observes
+        self._simulated = 0  # Frames of the environment
         self.watched: Any = None  # What the subgoal predictor knows of the episode
         self.worker = -1
         self.steps = self.chunks = 0
@@ -70,6 +76,8 @@ class RunningEpisode:
         goal = str(info["task_goal"][0])
         self.episode.goal = goal
         self._offer(info)
+        length = len(frames["state"])
+        frames = self._observed(frames, length, np.append(self.events.video(length - 1), length - 1))
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
             needs_video = self.video_frames and self._subgoals.sees_video
@@ -80,9 +88,25 @@ class RunningEpisode:
     def resume(self, frames: Observation, info: dict[str, Any]) -> None:
         """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
         self._offer(info)
-        count = self._count(info)
-        n_frames = count if self._robot.action.frames is not None else len(frames["state"])
+        count, length = self._count(info), len(frames["state"])
+        if self.events.holding is not None:
+            self.events.held += length
+            n_frames = min(self.events.holding.observed, length)
+            frames = self._observed(frames, length, np.arange(length - n_frames, length))
+            self._expect(frames, np.zeros(n_frames, bool), self._holding_actions(n_frames, info.get("held")), info)
+            return
+        n_frames = count if self._robot.action.frames is not None else length
+        self._observed(frames, length)
         self._expect(frames, np.zeros(n_frames, bool), self._sent[:count], info)
+
+    def next_event(self) -> Event | None:
+        """Let the events take place that are due; the one that holds the robot before the policy acts, if there is."""
+        return self.events.next(self.episode, self.steps, self._info.get("subtask", 0))
+
+    @property
+    def unobserved(self) -> int:
+        """Frames of the environment that events withheld so far; below 0 where they repeated some."""
+        return self._simulated - len(self._shown)
 
     def _offer(self, info: dict[str, Any]) -> None:
         """Let the episode choose among the options of now: which of them are possible may change."""
@@ -167,6 +191,23 @@ class RunningEpisode:
         """A digest of all executed actions: equal for two runs exactly if they did the same to the last bit."""
         return self._actions.hexdigest()[:16]
 
+    def _observed(self, frames: Observation, length: int, numbers: np.ndarray | None = None) -> Observation:
+        """Those of the environment's next frames that the policy observes; by default all."""
+        every = np.arange(length)
+        numbers = every if numbers is None else numbers
+        self._shown = np.concatenate([self._shown, self._simulated + numbers])
+        self._simulated += length
+        if np.array_equal(numbers, every):
+            return frames
+        lists = {name: [images[i] for i in numbers] for name, images in frames.items() if name != "state"}
+        return {**lists, "state": frames["state"][numbers]}
+
+    def _holding_actions(self, n_frames: int, held: np.ndarray | None) -> np.ndarray | None:
+        """The actions that led to frames at which the robot held its pose; None before the first action."""
+        if self._robot.action.frames is None:
+            return self._sent[:0]
+        return None if held is None else np.repeat(np.asarray(held, np.float32)[None], n_frames, 0)
+
     def _count(self, info: dict[str, Any]) -> int:
         count = int(info.get("executed", 0))
         self.steps += int(info.get("steps", count))
@@ -179,4 +220,5 @@ class RunningEpisode:
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need one frame an action."
             )
         self._frames, self._demo, self._led, self._info, self._at = frames, demo, led, info, 0
-        self.episode.begun(info.get("began", ()), self.video_frames)
+        began = np.searchsorted(self._shown, info.get("began", ()))  # as numbers of observed frames
+        self.episode.begun(began.tolist(), self.video_frames)

@@ -14,6 +14,7 @@ from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.events import folder_of, read_events
 from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -72,17 +73,47 @@ VIDEOS = "videos"
 class Evaluation(NamedTuple):
     """What came of a run: the records of its episodes, old and new, and what the policy did this time.
 
-    Of several processes that share a run each has the records that it wrote.
+    Of several processes that share a run each has the records that it wrote. matched: those of the plain run, where
+    `records` are of events.
     """
 
     records: list[EpisodeRecord]
     workload: Workload
+    matched: Sequence[EpisodeRecord] = ()
 
     @property
     def success_rate(self) -> float:
         """Share of successes, 0 to 1; an episode that ended in an error is none. NaN without episodes."""
         won = [record.outcome == "success" for record in self.records]
         return sum(won) / len(won) if won else float("nan")
+
+
+def evaluate_events(
+    policy: Policy,
+    jobs: Sequence[Job],
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    events: Sequence[str],
+    **how: Any,
+) -> Evaluation:
+    """Run every episode in `output`, then once more under each event, in a folder of its own below.
+
+    The runs have the same scenes and the same noise, and differ in the event alone. Without events it is `evaluate`,
+    which has the other arguments.
+
+    events: arms, such as `pause:100@subtask:2`.
+    """
+    for placed in (placed for event in events for placed in read_events(event)):
+        placed.event.check(policy)
+    arms = [replace(settings, event=event) for event in events]
+    plain = evaluate(policy, jobs, output, facts, settings, **how)
+    records: list[EpisodeRecord] = []
+    for arm in arms:
+        named, folder = replace(facts, event=arm.event), output / folder_of(str(arm.event))
+        run = evaluate(policy, jobs, folder, named, arm, **{**how, "times_from": how.get("times_from") or output})
+        records += run.records
+    return Evaluation(records, run.workload, plain.records) if arms else plain
 
 
 def evaluate(
@@ -192,6 +223,7 @@ def run_settings(
         "flow_steps": settings.flow_steps or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
         **{name: getattr(settings, name) for name in names},
         **{name: value for name in ("max_actions", "only_possible") if (value := getattr(settings, name))},
+        **({"event": settings.event} if settings.event else {}),
     }
 
 
@@ -238,7 +270,7 @@ def facts_of(
     return RunFacts(
         name or str(policy.config.get("name", "policy")), checkpoint_label(source), settings.seed, settings.split,
         settings.max_steps, subgoal, memory_budget(policy), composition_digest(policy.config),
-        identity_of(policy.config),
+        identity_of(policy.config), settings.event,
     )  # fmt: skip
 
 
@@ -261,7 +293,7 @@ def _done(output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | Non
     """What the folder has of these episodes, whichever process wrote it, or this one; folders below hold other runs."""
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
     run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
-                 facts.composition, facts.training)  # fmt: skip
+                 facts.composition, facts.training, facts.event)  # fmt: skip
     keys = {(job.task, job.episode) for job in jobs}
     files = sorted(output.glob("episodes*.jsonl")) if shard is None or shard.count == 1 else [output / shard.file]
     records = [record for path in files for record in read_records(path)]

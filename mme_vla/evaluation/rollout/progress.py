@@ -27,7 +27,7 @@ class RolloutProgress:
         self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
         self.total, self._outcomes = total, Counter(record.outcome for record in before)
         self._bar: Progress | None = None
-        if self.console.is_terminal and visible:
+        if self.console.is_terminal and self.console.file.isatty() and visible:
             clock = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
             columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), *clock)
             self._bar = Progress(*columns, console=self.console)

@@ -12,6 +12,8 @@ import numpy as np
 
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
+from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import past_view_spec
 from mme_vla.policy.base import Policy
@@ -33,6 +35,9 @@ class RenderPlan:
         self._grounded = subgoals is not None and subgoals.kind == "grounded"
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
+        events = [placed.event for placed in read_events(settings.event)]
+        self._held = sum(event.hold for event in events)
+        self._resampled = any(not event.placed for event in events)
         memory = policy.memory
         every = past_view_spec(memory) is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
@@ -45,7 +50,7 @@ class RenderPlan:
         if self._all:
             return None
         memory = self._policy.memory
-        if self._sees_video:
+        if self._sees_video or self._resampled:
             return self._render_request(EVERY)
         # Of memories that keep few frames all are rendered at once, of others none.
         few = memory is not None and memory.storage.keep_every > 1
@@ -55,7 +60,7 @@ class RenderPlan:
 
     def missing(self, frames: Observation) -> RenderRequest | None:
         """For a second reset, after one that gave these frames; None where it gave all that is needed."""
-        if self._all:
+        if self._all or self._resampled:
             return None
         video = len(frames["state"]) - 1
         needed = range(video) if self._sees_video else self._within(video, 0, video)
@@ -63,14 +68,16 @@ class RenderPlan:
             return None
         return self._render_request(frozenset(needed))
 
-    def of_chunk(self, n_observed: int, count: int, exec_start: int) -> RenderRequest | None:
-        """For `count` actions after `n_observed` frames, of which the first `exec_start` were the video."""
+    def of_chunk(self, running: RunningEpisode, count: int, unobserved: int = 0) -> RenderRequest | None:
+        """For the next `count` frames of an episode, after so many further ones that are not observed."""
         if self._all:
             return None
         if self._sees_passing:
             return self._render_request(EVERY)
+        n_observed = running.episode.n_observed_frames
         stop = n_observed + count if self._robot.action.frames is not None else EVERY.stop
-        return self._render_request(frozenset(self._within(exec_start, n_observed, stop)))
+        frames = self._within(running.video_frames, n_observed, stop)
+        return self._render_request(frozenset(frame + running.unobserved + unobserved for frame in frames))
 
     def _render_request(self, frames: Container[int]) -> RenderRequest:
         return RenderRequest(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)
@@ -83,7 +90,8 @@ class RenderPlan:
 
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
-        # A motion takes any number of frames, so that the policy may act at each.
-        action = self._robot.action
-        apart = 1 if action.frames is None else min(self._settings.execute or action.execute, action.horizon)
-        return frames_read(self._policy, exec_start + np.arange(0, self._settings.max_steps + 2, apart), exec_start)
+        # A motion, or an event that holds the robot, takes any number of frames: the policy may act at each.
+        action, most = self._robot.action, self._settings.max_steps + self._held + 2
+        anywhere = action.frames is None or self._held
+        apart = 1 if anywhere else min(self._settings.execute or action.execute, action.horizon)
+        return frames_read(self._policy, exec_start + np.arange(0, most, apart), exec_start)

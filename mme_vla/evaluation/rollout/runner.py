@@ -20,6 +20,7 @@ from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.curves import EXTRA as PROCESS
 from mme_vla.evaluation.rollout.episode import RunningEpisode
+from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -85,6 +86,7 @@ class RunFacts:
     memory_budget: int | None = None
     composition: str | None = None
     training: TrainingIdentity | None = None
+    event: str | None = None
 
 
 @dataclass
@@ -131,6 +133,7 @@ class Rollout:
 
     def __post_init__(self) -> None:
         self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(self.settings.max_batch)
+        self._events = read_events(self.settings.event)
         self._render_plan = RenderPlan(self.policy, self.subgoals, self.settings)
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
@@ -162,7 +165,7 @@ class Rollout:
         trace = None
         if self.subgoals is not None:
             trace = SubgoalTrace(self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}")
-        running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace)
+        running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace, self._events)
         running.worker = worker
         self._running[worker] = running
         self.envs.start(worker, job, draw=self._render_plan.before_video())
@@ -219,8 +222,17 @@ class Rollout:
             else:
                 step.work.read()
                 if not step.work.pieces:
-                    self._scheduler.acting.append(step.work)
+                    self._proceed(step.work)
         self.workload.policy_s += time.perf_counter() - begun
+
+    def _proceed(self, running: RunningEpisode) -> None:
+        """Have the policy act, unless an event holds the robot first; every frame is read."""
+        event = running.next_event()
+        if event is None:
+            self._scheduler.acting.append(running)
+            return
+        draw = self._render_plan.of_chunk(running, event.observed, event.hold - event.observed)
+        self.envs.send(running.worker, {"hold": event.hold, "subgoal": running.episode.subgoal, "draw": draw})
 
     def _act(self, batch: list[RunningEpisode]) -> None:
         begun = time.perf_counter()
@@ -240,7 +252,7 @@ class Rollout:
                 self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
                 continue
             running.set_actions(actions)
-            draw = self._render_plan.of_chunk(running.episode.n_observed_frames, len(actions), running.video_frames)
+            draw = self._render_plan.of_chunk(running, len(actions))
             self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
             self._scheduler.later[running] = None
 
@@ -272,6 +284,7 @@ class Rollout:
                 **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
                 **({PROCESS: running.process} if running.process else {}),
+                **({"events": running.events.log} if running.events.log else {}),
                 **({"notes": running.episode.written} if running.episode.written else {}),
                 **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },

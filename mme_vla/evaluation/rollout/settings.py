@@ -9,6 +9,7 @@ from mme_vla.config.sections import NonNegativeInt, Positive, PositiveInt, read_
 from mme_vla.envs.base import environment
 from mme_vla.envs.metadata import read_variant
 from mme_vla.errors import UserError
+from mme_vla.evaluation.rollout.events import read_events
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class RolloutSettings:
     timeout_s: seconds after which an environment that does not respond is replaced.
     draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes are the same.
     subgoal_log: whether every predicted subgoal is logged with its image.
+    event: what happens in every episode (`rollout.events`), such as `pause:100@subtask:2`; None for nothing.
     """
 
     seed: NonNegativeInt = 42
@@ -47,10 +49,13 @@ class RolloutSettings:
     draw: Literal["needed", "all"] = "needed"
     video: Literal["none", "all", "success", "failure"] = "none"
     subgoal_log: bool = True
+    event: str | None = None
 
     def __post_init__(self) -> None:
         source = environment(self.env)
         source.check_split(self.split)
+        if any(placed.event.hold for placed in read_events(self.event)):
+            source.check_hold()
         if not self.max_steps:
             object.__setattr__(self, "max_steps", source.step_limit(self.split))
         varied = read_variant(self.split) is not None

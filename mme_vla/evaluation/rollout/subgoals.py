@@ -15,7 +15,7 @@ import numpy as np
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Results
-from mme_vla.evaluation.results.tables import Table, task_table
+from mme_vla.evaluation.results.tables import Table, task_tables
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.subgoal.text import mark_points
@@ -117,12 +117,7 @@ def point_distances(predicted: str | None, meant: str) -> list[float] | None:
 def subgoal_tables(results: Results) -> list[Table]:
     """Subgoals of every method that has a predictor, per task, over all its runs."""
     columns = ["", "episodes", "subgoals", "right words (%)", "distance (pixels)", "asked", "unusable answers"]
-    tables = []
-    for method in results.methods:
-        records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
-        title = f"{method.label}: subgoals beside the environment's own"
-        tables += task_table(title, columns, records, results.protocol.tasks, _row)
-    return tables
+    return task_tables(results, EXTRA, "subgoals beside the environment's own", columns, _row)
 
 
 def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:

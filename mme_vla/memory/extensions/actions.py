@@ -53,6 +53,7 @@ class MotionRows(History):
         device: torch.device | None = None,
     ) -> None:
         super().__init__(source.spec, source.exec_start)
+        self.clock_starts = source.clock_starts
         self._source, self._read, self._width, self._memory, self._device = source, read, width, memory, device
 
     def __len__(self) -> int:

@@ -75,4 +75,4 @@ class FrameMemory(MemoryModule):
         return all_patches(self.chosen(step, history.exec_start), self.storage.grid)
 
     def padded_length(self, count: int) -> int:
-        return count
+        return count if self.pad_left else self.capacity

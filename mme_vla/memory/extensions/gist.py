@@ -56,7 +56,7 @@ class Gist(FrameMemory):
             grid, pooling: a frame that is read is grid×grid tokens.
             stride: frames between two that are read, counted back from the current one; the first is always read.
             layers, hidden, heads: of the gists' encoder; its width is by default a quarter of `d_vision`, at least 64.
-            encoder: `position_dim` and `position_hidden` of both `FeatureEncoder`s.
+            encoder: `position_dim`, `position_hidden` and `positions` of both `FeatureEncoder`s.
         """
         super().__init__()
         check_sizes("memory", anchors=anchors, recent=recent, gists=gists, stride=stride, layers=layers)

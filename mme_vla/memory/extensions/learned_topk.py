@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import require
-from mme_vla.memory.base import FeatureEncoder, MemoryModule, all_patches, position_features, union_frames
+from mme_vla.memory.base import FeatureEncoder, MemoryModule, all_patches, union_frames
 from mme_vla.memory.extensions.attending import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
@@ -60,7 +60,7 @@ class LearnedTopK(MemoryModule):
             temperature: how far from the k-th best a score may be to be learned from; scores have variance 1.
             layers, registers, hidden, heads: of the network that scores; its width is by default a quarter of
                 `d_vision`, at least 64.
-            encoder: `position_dim` and `position_hidden` of both `FeatureEncoder`s.
+            encoder: `position_dim`, `position_hidden` and `positions` of both `FeatureEncoder`s.
         """
         super().__init__()
         require(
@@ -141,5 +141,5 @@ class LearnedTopK(MemoryModule):
     def _remainder(self, history: HistoryTokens, share: Tensor) -> Tensor:
         """One token [b, 1, d] for what is not kept: the mean of its features and of its places, by share [b, n]."""
         features = (history.features.float() * share[..., None]).sum(1, keepdim=True)
-        places = position_features(history.positions, self.encoder.position_dim) * share[..., None]
+        places = self.encoder.places(history.positions) * share[..., None]
         return self.encoder.encode(features, places.sum(1, keepdim=True))

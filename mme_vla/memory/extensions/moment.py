@@ -53,7 +53,7 @@ class Moment(FrameMemory):
             grid, pooling: a frame that is read is grid×grid tokens.
             stride: frames between two that are read (`recurrent_frames`; up to 5/8 of them from the video).
             layers, hidden, heads: of the causal encoder; its width is by default a quarter of `d_vision`, at least 64.
-            encoder: `position_dim` and `position_hidden` of the `FeatureEncoder`.
+            encoder: `position_dim`, `position_hidden` and `positions` of the `FeatureEncoder`.
         """
         super().__init__()
         check_sizes("memory", moments=moments, stride=stride, layers=layers)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches
-from mme_vla.memory.framesamp import evenly_spaced_frames
+from mme_vla.memory.framesamp import evenly_spaced_frames, whole_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -46,15 +46,11 @@ class Retrieval(PerceptualMemory):
             cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1 never cuts.
             longest: most stored frames of a chunk.
         """
-        require(
-            budget % grid**2 == 0 and budget >= grid**2,
-            f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
-            f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}.",
-        )
+        frames = whole_frames(budget, grid)
         require(-1 <= cut <= 1, f"memory.cut={cut} is a cosine: it lies between -1 (never cut) and 1 (cut everywhere).")
         check_sizes("memory", longest=longest)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
-        self.frames, self.cut, self.longest = budget // grid**2, cut, longest
+        self.frames, self.cut, self.longest = frames, cut, longest
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         frames = self.storage.stored_frames(step + 1)

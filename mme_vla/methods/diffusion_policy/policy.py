@@ -103,10 +103,7 @@ class DiffusionPolicy(NetworkPolicy):
         return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
 
     def forward(
-        self,
-        batch: DiffusionBatch,
-        noise: Mapping[str, Tensor] | None = None,
-        corner: tuple[int, int] | None = None,
+        self, batch: DiffusionBatch, noise: Mapping[str, Tensor] | None = None, corner: tuple[int, int] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
@@ -140,7 +137,6 @@ class DiffusionPolicy(NetworkPolicy):
         self.backbone.recomputed = mode
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The memory's tower, the image encoder, and the U-Net."""
         tower = [] if self.memory is None else [ShardGroup(self.backbone.vision, full=True)]
         return [*tower, ShardGroup(self.backbone.image_encoder), ShardGroup(self.backbone.unet)]
 
@@ -196,7 +192,6 @@ class DiffusionPolicy(NetworkPolicy):
     # Episodes
 
     def observation(self, episodes: Sequence[Episode]) -> DiffusionBatch:
-        """The windows and goals of running episodes."""
         processor = self.require_processor()
         images, states = zip(*(e.window for e in episodes), strict=True)
         text = torch.stack([e.prompt for e in episodes])

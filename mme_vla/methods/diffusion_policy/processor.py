@@ -2,8 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -13,10 +11,10 @@ from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, missing_extra, require
+from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, require
 from mme_vla.memory.base import stack_history
-from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
-from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, Sample, SampleSpec, StatsSpec
+from mme_vla.methods.goal_encoders import HASHED, ClipEncoder, GoalEncoder, GoalProcessor, direction_of
+from mme_vla.processing.base import STATS_FILE, Sample, SampleSpec, StatsSpec
 from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.normalise import NormStats, normalize, unnormalize
 from mme_vla.registry import PROCESSORS
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
 
 
 CLIP = "openai/clip-vit-base-patch32"
-CLIP_WIDTH = 512
 LONGEST = 77
 """Tokens that CLIP reads."""
 
@@ -42,42 +39,14 @@ class HashedWords(GoalEncoder):
         return functional.normalize(total, dim=0)
 
 
-class ClipText(GoalEncoder):
-    """CLIP's text tower and projection, frozen, on the CPU; loaded with the first text."""
+class ClipText(ClipEncoder):
+    """The projected state of the text's end."""
 
-    def __init__(self, width: int, source: str | Path = CLIP) -> None:
-        """Remember where it is.
-
-        Args:
-            source: the hub's name of a CLIP, or a folder as transformers writes them.
-        """
-        super().__init__(width)
-        self.source = str(source)
-
-    @cached_property
-    def _parts(self) -> tuple[Any, "CLIPTextModelWithProjection"]:
-        try:
-            from transformers import CLIPTextModelWithProjection, CLIPTokenizer
-        except ImportError:
-            raise missing_extra("Diffusion Policy", "baselines") from None
-        try:
-            tokenizer = CLIPTokenizer.from_pretrained(self.source)
-            tower = CLIPTextModelWithProjection.from_pretrained(self.source)
-        except (OSError, ValueError) as error:
-            raise UserError(
-                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]}). Connect once so that it "
-                "is kept, give a folder that holds it (processor.text=<folder>), or try things out with "
-                "processor.text=hashed."
-            ) from None
-        require(
-            tower.config.projection_dim == self.width,
-            f"{self.source} gives {tower.config.projection_dim} numbers a text, the network reads {self.width}: "
-            "set backbone.text_dim.",
-        )
-        return tokenizer, tower.eval().requires_grad_(False)
+    method, tower = "Diffusion Policy", "CLIPTextModelWithProjection"
+    size, option = "projection_dim", "backbone.text_dim"
 
     def encode(self, text: str) -> Tensor:
-        tokenizer, tower = self._parts
+        tokenizer, tower = self.parts
         read = tokenizer([text], padding="longest", truncation=True, max_length=LONGEST, return_tensors="pt")
         return text_features(tower, read["input_ids"], read["attention_mask"])[0]
 
@@ -111,9 +80,10 @@ class DiffusionBatch(TensorStruct):
 
 
 @PROCESSORS.register("diffusion_policy")
-class DiffusionProcessor(PolicyProcessor):
+class DiffusionProcessor(GoalProcessor):
     """Images of one size without augmentation, states and actions between their extremes, and the goal's vector."""
 
+    name, trusted = "diffusion_policy", (CLIP_NAME, HASHED)
     stats_spec = StatsSpec(horizon=1, every=True, extremes=True)
 
     def __init__(
@@ -166,10 +136,6 @@ class DiffusionProcessor(PolicyProcessor):
             stats=None if stats is None else NormStats.load(stats), **settings,
         )  # fmt: skip
 
-    @property
-    def prompt_spec(self) -> PromptSpec:
-        return PromptSpec(self.text_name)
-
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
@@ -183,16 +149,6 @@ class DiffusionProcessor(PolicyProcessor):
         """Memory frames [n, H, W, 3] uint8 as [n, 3, s, s] float32 in [−1, 1]."""
         array = frames if isinstance(frames, Tensor) else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
         return resize_with_pad(array.to(device) if device is not None else array, self.memory_size)
-
-    def prompt(
-        self,
-        goal: str,
-        subgoal: str | None = None,
-        state: np.ndarray | Tensor | None = None,
-        past_actions: np.ndarray | Tensor | None = None,
-    ) -> Tensor:
-        """The goal's vector [d]; nothing else is read."""
-        return self.text(goal)
 
     def states(self, raw: np.ndarray | Tensor) -> Tensor:
         """Raw states [..., s] between their extremes, −1 … 1."""
@@ -233,7 +189,7 @@ class DiffusionProcessor(PolicyProcessor):
 
     def to_config(self) -> dict[str, Any]:
         return {
-            "name": "diffusion_policy",
+            "name": self.name,
             "picture": list(self.picture),
             "text": self.text_name,
             "text_dim": self.text.width,
@@ -243,13 +199,3 @@ class DiffusionProcessor(PolicyProcessor):
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
         }
-
-    @classmethod
-    def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
-        """Read what `save` wrote.
-
-        Args:
-            folder: of a checkpoint, which may be untrusted.
-            tokenizer: the folder of a CLIP, in place of what `processor.json` names.
-        """
-        return load_with_goal_encoder(cls, "diffusion_policy", Path(folder), tokenizer, trusted=(CLIP_NAME, HASHED))

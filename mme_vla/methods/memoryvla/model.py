@@ -150,19 +150,17 @@ class Core(nn.Module):
     def noise_error(
         self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
     ) -> Tensor:
-        """The head's error [n, h] on chunks [n, h, a], noised with the given noise."""
+        """The head's error [r·m, h] on the chunks [m, h, a] of m moments r times over, each time with its own noise.
+
+        Args:
+            draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform.
+        """
+        repeats = len(draws["noise"]) // len(actions)
+        cognition, perceptual, actions = (x.repeat(repeats, 1, 1) for x in (cognition, perceptual, actions))
         noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
         drop = draws["drop"] < self.config.dropout
         predicted = self.head(noised, draws["steps"], cognition, perceptual, drop)
         return (predicted.float() - draws["noise"].float()).square().mean(-1)
-
-    def copies_error(
-        self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
-    ) -> Tensor:
-        """`noise_error` [r·m, h] on the whole batch of m moments r times over, each time with its own draws."""
-        repeats = len(draws["noise"]) // len(actions)
-        cognition, perceptual, actions = (x.repeat(repeats, 1, 1) for x in (cognition, perceptual, actions))
-        return self.noise_error(actions, cognition, perceptual, draws)
 
     def sample(self, noise: Tensor, cognition: Tensor, perceptual: Tensor, steps: int | None = None) -> Tensor:
         """The chunk [b, h, a] that DDIM with guidance makes of noise; nothing is clipped."""
@@ -218,8 +216,6 @@ class MemoryVlaCore(Core):
     def init_state(self) -> BankStates:
         return BankStates(self.cognition_bank.init_state(1), self.perceptual_bank.init_state(self.patches))
 
-    # Training
-
     def loss(
         self,
         cognition: Tensor,
@@ -229,15 +225,8 @@ class MemoryVlaCore(Core):
         sequences: Sequence[Tensor],
         draws: Mapping[str, Tensor],
     ) -> Tensor:
-        """The squared error of the predicted noise [r·m, h], averaged over the numbers of an action.
-
-        Args:
-            cognition: [m, 1, d]. features: [m, p, c]. actions: [m, h, a]. times: [m].
-            sequences: places of the moments that share a bank, in the order of time.
-            draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform; the whole batch r times over.
-        """
-        read, perceptual = self.through(cognition, features, times, sequences)
-        return self.copies_error(actions, read, perceptual, draws)
+        """As `noise_error`, of m moments as `through` takes them."""
+        return self.noise_error(actions, *self.through(cognition, features, times, sequences), draws)
 
     def through(
         self,
@@ -250,8 +239,6 @@ class MemoryVlaCore(Core):
         """See `Core.through`; each sequence begins with empty banks, which take its moments one after the other."""
         read = self.cognition_bank.run(cognition, times, sequences)[0]
         return read, self.perceptual_bank.run(self.compression(features), times, sequences)[0]
-
-    # Acting
 
     def read_banks(self, states: Sequence[BankStates], cognition: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """What the head reads of b episodes' current moments: fused cognition [b, 1, d] and perceptual tokens."""

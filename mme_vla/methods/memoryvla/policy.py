@@ -176,7 +176,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
             read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
-            losses = self.core.copies_error(batch.actions[batch.valid], read, perceptual, sampled)  # r·m h
+            losses = self.core.noise_error(batch.actions[batch.valid], read, perceptual, sampled)  # r·m h
         counted = None
         if batch.action_mask is not None:
             of_moments = batch.action_mask[batch.valid]
@@ -189,7 +189,6 @@ class MemoryVlaPolicy(NetworkPolicy):
         self.vlm.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """Towers, word embedding, every layer of the language model, and every block of the head."""
         full_modules = (self.vlm.vision, self.vlm.language.model.embed_tokens)
         layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
         return [*(ShardGroup(module, full=True) for module in full_modules), *map(ShardGroup, layers)]

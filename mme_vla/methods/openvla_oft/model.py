@@ -86,11 +86,7 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
         *("projector.fc1", "projector.fc2", "projector.fc3"),
         *("q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj", "lm_head"),
     )
-    PARTS: ClassVar[Mapping[str, str]] = {
-        "vision": r"vlm\.vision\.",
-        "vlm": r"vlm\.",
-        "action": "",
-    }
+    PARTS: ClassVar[Mapping[str, str]] = {"vision": r"vlm\.vision\.", "vlm": r"vlm\.", "action": ""}
 
     def __init__(self, config: OpenVlaConfig, extra_experts: Mapping[str, Any] | None = None) -> None:
         super().__init__(config, extra_experts)

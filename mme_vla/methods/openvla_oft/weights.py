@@ -18,7 +18,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import WEIGHTS, cast, read_files
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import inside, read_json
-from mme_vla.weights.tables import Adapter, NameTable, Piece
+from mme_vla.weights.tables import Adapter, Piece
 from mme_vla.weights.torch_files import read_torch_file
 
 VLA, HEAD, STATE = "vla/", "action_head/", "proprio_projector/"
@@ -52,12 +52,6 @@ def openvla_name(target: str) -> str | None:
         if pattern.match(target):
             return pattern.sub(replacement, target)
     return None
-
-
-def openvla_table(names: Iterable[str]) -> NameTable:
-    """The table of those of our tensors that have a name there."""
-    pairs = ((name, openvla_name(name)) for name in names)
-    return {target: [Piece(source)] for target, source in pairs if source is not None}
 
 
 FOLDER, FILE, SETTINGS = "lora_adapter", "adapter_model.safetensors", "adapter_config.json"
@@ -137,10 +131,8 @@ def openvla_adapter(policy: Policy) -> Adapter:
             "start model=memoryvla from it (init_from=…)."
         )
     names = [name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name]
-    return Adapter(
-        openvla_table(names),
-        fresh=frozenset(name for name in names if policy.finetune_spec.component_of(name) == "action"),
-    )
+    table = {name: [Piece(source)] for name in names if (source := openvla_name(name)) is not None}
+    return Adapter(table, fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) == "action"))
 
 
 def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
@@ -176,13 +168,9 @@ def read_dataset_statistics(folder: Path) -> NormStats | None:
     of = next(iter(data.values())) if len(data) == 1 else None
     if not isinstance(of, dict) or not all(isinstance(of.get(source_name), dict) for source_name in _FEATURES.values()):
         return None
-    return NormStats(
-        **{target_name: QuantileStats.from_dict(_known(of[name]), name) for target_name, name in _FEATURES.items()}
-    )
-
-
-def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: values[key] for key in ("mean", "std", "q01", "q99", "min", "max") if key in values}
+    keys = ("mean", "std", "q01", "q99", "min", "max")
+    known = {name: {key: of[name][key] for key in keys if key in of[name]} for name in _FEATURES.values()}
+    return NormStats(**{part: QuantileStats.from_dict(known[name], name) for part, name in _FEATURES.items()})
 
 
 def write_openvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:

@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from mme_vla.config.sections import read_section
-from mme_vla.errors import UserError, brief, check_multiple, require
+from mme_vla.config.sections import Range, read_section
+from mme_vla.errors import UserError, check_multiple, require
 from mme_vla.methods.sam2act.geometry import VIEWS
 
 LEVELS = 4
 """Stages of the encoder, each half as fine as the one before."""
-LARGEST = 2**16
+Size = Annotated[int, Range(1, 2**16)]
 
 
 @dataclass(frozen=True)
@@ -22,17 +22,16 @@ class EncoderSizes:
     background: side of the table of positions. neck: width of its output maps. lora: rank of the adapters.
     """
 
-    width: int = 112
-    heads: int = 2
-    blocks: tuple[int, ...] = (2, 3, 16, 3)
-    windows: tuple[int, ...] = (8, 4, 14, 7)
-    global_blocks: tuple[int, ...] = (12, 16, 20)
-    background: int = 14
-    neck: int = 256
-    lora: int = 16
+    width: Size = 112
+    heads: Size = 2
+    blocks: tuple[Size, ...] = (2, 3, 16, 3)
+    windows: tuple[Size, ...] = (8, 4, 14, 7)
+    global_blocks: tuple[Size, ...] = (12, 16, 20)
+    background: Size = 14
+    neck: Size = 256
+    lora: Size = 16
 
     def __post_init__(self) -> None:
-        _check_sizes(self, "backbone.encoder")
         for name in ("blocks", "windows"):
             require(
                 len(getattr(self, name)) == LEVELS, f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage."
@@ -59,24 +58,24 @@ class SAM2ActSizes:
     """
 
     encoder: EncoderSizes = field(default_factory=EncoderSizes)
-    grid: int = 16
-    patch: int = 14
-    width: int = 512
-    heads: int = 8
-    depth: int = 8
-    language: int = 512
-    words: int = 77
-    sam: int = 48
-    pictures: int = 48
-    state: int = 32
-    state_dim: int = 4
-    rotation_bins: int = 72
-    head: int = 256
-    memory: int = 64
-    memory_layers: int = 4
-    memory_feedforward: int = 2048
-    mask_stages: int = 4
-    remembered: int = 9
+    grid: Size = 16
+    patch: Size = 14
+    width: Size = 512
+    heads: Size = 8
+    depth: Size = 8
+    language: Size = 512
+    words: Size = 77
+    sam: Size = 48
+    pictures: Size = 48
+    state: Size = 32
+    state_dim: Size = 4
+    rotation_bins: Size = 72
+    head: Size = 256
+    memory: Size = 64
+    memory_layers: Size = 4
+    memory_feedforward: Size = 2048
+    mask_stages: Size = 4
+    remembered: Size = 9
 
     @classmethod
     def from_dict(cls, section: Mapping[str, Any]) -> Self:
@@ -84,7 +83,6 @@ class SAM2ActSizes:
         return read_section(cls, {key: value for key, value in section.items() if key != "name"}, "backbone")
 
     def __post_init__(self) -> None:
-        _check_sizes(self, "backbone")
         check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)
         check_multiple("backbone.", "depth", self.depth, "pairs", 2)  # half of the layers see one view alone
         for name in ("token", "memory"):
@@ -105,12 +103,3 @@ class SAM2ActSizes:
     def feature(self) -> int:
         """Width of what the heads read."""
         return 2 * VIEWS * self.token
-
-
-def _check_sizes(sizes: Any, where: str) -> None:
-    for name, value in vars(sizes).items():
-        for number in value if isinstance(value, tuple) else [value]:
-            require(
-                not (isinstance(number, int) and not 1 <= number <= LARGEST),
-                f"{where}.{name}={brief(value)}: sizes are whole numbers from 1 to {LARGEST}.",
-            )

@@ -64,11 +64,6 @@ class Cube:
         return (low + high) / 2, (high - low).max() / 2
 
 
-def zoom(points: Tensor, centre: Tensor, factor: float = ZOOM) -> Tensor:
-    """Points [b, n, 3] as seen from closer to a centre [b, 3]."""
-    return factor * (points - centre[:, None])
-
-
 def zoom_back(point: Tensor, centre: Tensor, factor: float = ZOOM) -> Tensor:
     """One point [b, 3] of a closer look, in the coordinates of the first."""
     return point / factor + centre

@@ -1,7 +1,6 @@
 """`SAM2ActPolicy`: from coloured points to the next waypoint, with a memory of keyframes."""
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -91,13 +90,6 @@ def augmented(
     )
 
 
-def memory_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, length: int) -> dict[str, Tensor]:
-    """The loss of the memory's stage: the coarse heatmaps of sequences of `length` keyframes."""
-    images = cloud_images(scenes.points, scenes.colours, cube, network.sizes.side)
-    logits = network.coarse_sequences(network.encode_views(images, scenes.state, scenes.language), length)
-    return {"heatmap": heatmap_loss(logits, scenes.target).mean()}
-
-
 def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Tensor | None = None) -> dict[str, Tensor]:
     """The losses of the first stage, each of weight 1; single keyframes, no memory.
 
@@ -138,22 +130,6 @@ STAGES = {
 """Stage → pattern of the parameters that learn in it, as the authors froze the others."""
 
 
-def check_stage(stage: str) -> str:
-    check_choice("stage", stage, STAGES)
-    return stage
-
-
-def select_trained(network: nn.Module, stage: str) -> list[nn.Parameter]:
-    """Freeze what a stage does not train, and return what it does."""
-    check_stage(stage)
-    trained = []
-    for name, parameter in network.named_parameters():
-        parameter.requires_grad_(re.match(STAGES[stage], name) is not None)
-        if parameter.requires_grad:
-            trained.append(parameter)
-    return trained
-
-
 WIDTH = 7
 """Numbers of a waypoint: position, roll-pitch-yaw, gripper."""
 
@@ -181,7 +157,8 @@ class SAM2ActPolicy(NetworkPolicy):
             processor, config, options: of `NetworkPolicy`. The authors train in float16.
         """
         super().__init__(processor, config, **options)
-        self.backbone, self.stage = backbone, check_stage(stage)
+        check_choice("stage", stage, STAGES)
+        self.backbone, self.stage = backbone, stage
         self.horizon, self.action_dim = 1, WIDTH
         # Single keyframes first, then one more than can be remembered.
         self.keyframes = 1 if stage == "first" else backbone.sizes.remembered + 1
@@ -238,7 +215,11 @@ class SAM2ActPolicy(NetworkPolicy):
                 offsets = sampled["told"].flatten(0, 1) if self.training else None
                 parts = first_loss(self.backbone, scenes, cube, offsets)
             else:
-                parts = memory_loss(self.backbone, scenes, cube, batch.points.shape[1])
+                # The memory's stage learns the coarse heatmaps of sequences of keyframes.
+                images = cloud_images(scenes.points, scenes.colours, cube, sizes.side)
+                views = self.backbone.encode_views(images, scenes.state, scenes.language)
+                logits = self.backbone.coarse_sequences(views, batch.points.shape[1])
+                parts = {"heatmap": heatmap_loss(logits, scenes.target).mean()}
         loss = torch.stack(list(parts.values())).sum()
         return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
 
@@ -246,7 +227,6 @@ class SAM2ActPolicy(NetworkPolicy):
         self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """SAM2's encoder, and every layer of both transformers."""
         stages = (self.backbone.coarse, self.backbone.fine)
         layers = [ShardGroup(layer) for stage in stages for layer in stacked_layers(stage.transformer)]
         return [ShardGroup(self.backbone.encoder, full=True), *layers]
@@ -261,17 +241,15 @@ class SAM2ActPolicy(NetworkPolicy):
         waypoints = []
         for i in range(len(batch.points)):
             state = BankState()
-            scenes = [self._scene_of(batch, i, k) for k in range(batch.points.shape[1])]
+            colours = batch.colours[i].float() / 255
+            scenes = [
+                SceneInputs(batch.points[i, k], colours[k], batch.state[i, k], batch.language[i])
+                for k in range(batch.points.shape[1])
+            ]
             for earlier in scenes[:-1]:
                 state = self.watch(earlier, state)
             waypoints.append(self._decide(scenes[-1], state)[0])
         return torch.stack(waypoints)[:, None]
-
-    def _scene_of(self, batch: KeyframeBatch, sample: int, keyframe: int) -> SceneInputs:
-        colours = batch.colours[sample, keyframe].float() / 255
-        return SceneInputs(
-            batch.points[sample, keyframe], colours, batch.state[sample, keyframe], batch.language[sample]
-        )
 
     def watch(self, scene: SceneInputs, remembered: BankState) -> BankState:
         """What an episode remembers after a frame at which nothing is decided."""
@@ -290,11 +268,9 @@ class SAM2ActPolicy(NetworkPolicy):
     # Episodes
 
     def start_episode(self, goal: str, seed: int = 0) -> KeyframeEpisode:
-        """Begin an episode with an empty bank."""
         return KeyframeEpisode(self, goal, seed)
 
     def observation(self, episodes: "Sequence[Episode]") -> list[SceneInputs]:
-        """What running episodes see now."""
         return [episode.scene_inputs() for episode in episodes if isinstance(episode, KeyframeEpisode)]
 
     def predict_chunk(

@@ -3,8 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -13,8 +11,8 @@ from torch import Tensor, nn
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_integer, missing_extra, require
-from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
+from mme_vla.errors import UserError, brief, check_integer, require
+from mme_vla.methods.goal_encoders import HASHED, ClipEncoder, GoalEncoder, GoalProcessor, direction_of
 from mme_vla.methods.sam2act.geometry import (
     EMPTY,
     VIEWS,
@@ -24,7 +22,7 @@ from mme_vla.methods.sam2act.geometry import (
     unproject,
     virtual_images,
 )
-from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, SampleSpec
+from mme_vla.processing.base import STATS_FILE, SampleSpec
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import TensorStruct
@@ -114,29 +112,22 @@ def zoomed_images(points: Tensor, colours: Tensor, cube: Cube, centre: Tensor, z
 def _render_images(points: Tensor, colours: Tensor, inside: Tensor, side: int) -> Tensor:
     if points.is_meta:  # shapes alone: there is nothing to draw
         return points.new_empty(len(points), VIEWS, CHANNELS, side, side)
+    blank = torch.zeros(VIEWS, 7, side, side, device=points.device)
+    blank[:, 6] = EMPTY
+    nothing = torch.cat([blank, constant_channels(side, points.device)], 1)
     images = [
-        virtual_images(cloud[mask], paint[mask], side) if mask.any() else _nothing(side, cloud.device)
+        virtual_images(cloud[mask], paint[mask], side) if mask.any() else nothing
         for cloud, paint, mask in zip(points, colours, inside, strict=True)
     ]
     return torch.stack(images)
 
 
-def _nothing(side: int, device: torch.device) -> Tensor:
-    blank = torch.zeros(VIEWS, 7, side, side, device=device)
-    blank[:, 6] = EMPTY
-    return torch.cat([blank, constant_channels(side, device)], 1)
-
-
-class GoalTokens(GoalEncoder):
-    """Texts → tokens [words, width]."""
+class HashedTokens(GoalEncoder):
+    """One fixed random vector [words, width] a word, zeros behind the last: equal words, equal vectors."""
 
     def __init__(self, width: int, words: int) -> None:
         super().__init__(width)
         self.words = words
-
-
-class HashedTokens(GoalTokens):
-    """One fixed random vector a word, zeros behind the last: equal words, equal vectors."""
 
     def encode(self, text: str) -> Tensor:
         tokens = torch.zeros(self.words, self.width)
@@ -145,41 +136,22 @@ class HashedTokens(GoalTokens):
         return tokens
 
 
-class ClipTokens(GoalTokens):
-    """All states of a CLIP's text tower after its last norm, frozen, on the CPU; loaded with the first text.
+class ClipTokens(ClipEncoder):
+    """All states [words, width] of the text tower after its last norm.
 
     The released model reads OpenAI's RN50 text tower (width 512), which no repository of the hub holds in this form.
     """
 
-    def __init__(self, width: int, words: int, folder: str) -> None:
-        """Remember where it is: a folder with a CLIP text model and its tokenizer, as transformers writes them."""
-        super().__init__(width, words)
-        self.folder = folder
+    method, tower = "SAM2Act+", "CLIPTextModel"
+    size, option = "hidden_size", "backbone.language"
 
-    @cached_property
-    def _parts(self) -> tuple[Any, Any]:
-        try:
-            import transformers
-        except ImportError as error:
-            raise missing_extra("SAM2Act+", "baselines") from error
-        try:
-            tokenizer = transformers.CLIPTokenizer.from_pretrained(self.folder)
-            tower = transformers.CLIPTextModel.from_pretrained(self.folder)
-        except (OSError, ValueError) as error:
-            raise UserError(
-                f"No text tower of a CLIP at {self.folder} ({str(error).splitlines()[0]}). Give a folder that holds "
-                "one (processor.text=<folder>), or processor.text=hashed to try things out."
-            ) from None
-        require(
-            tower.config.hidden_size == self.width,
-            f"{self.folder} gives {tower.config.hidden_size} numbers a token, the network reads {self.width}: set "
-            "backbone.language.",
-        )
-        return tokenizer, tower.eval().requires_grad_(False)
+    def __init__(self, width: int, words: int, folder: str) -> None:
+        super().__init__(width, folder)
+        self.words = words
 
     @torch.no_grad()
     def encode(self, text: str) -> Tensor:
-        tokenizer, tower = self._parts
+        tokenizer, tower = self.parts
         read = tokenizer([text], padding="max_length", truncation=True, max_length=self.words, return_tensors="pt")
         # The released code fills with zeros, where transformers repeats the end-of-text token.
         ids = read["input_ids"] * read["attention_mask"]
@@ -209,10 +181,12 @@ class Recorded(Protocol):
 
 
 @PROCESSORS.register(NAME)
-class SAM2ActProcessor(PolicyProcessor):
+class SAM2ActProcessor(GoalProcessor):
     """Nothing here is normalised: points are metres, and the network's output is a waypoint in the world."""
 
+    name = NAME
     samples = SampleSpec(kind="keyframes")
+    text: HashedTokens | ClipTokens
 
     def __init__(
         self,
@@ -290,20 +264,6 @@ class SAM2ActProcessor(PolicyProcessor):
         stacked = np.stack([np.asarray(view) for view in views], axis=-4)
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(stacked, -1, -3)))
 
-    def prompt(
-        self,
-        goal: str,
-        subgoal: str | None = None,
-        state: np.ndarray | Tensor | None = None,
-        past_actions: np.ndarray | Tensor | None = None,
-    ) -> Tensor:
-        """The goal's tokens [l, w]; nothing else is read."""
-        return self.text(goal)
-
-    @property
-    def prompt_spec(self) -> PromptSpec:
-        return PromptSpec(self.text_name)
-
     def shots(self, views: Mapping[str, np.ndarray], index: int) -> list[Shot]:
         """The cameras' shots of one of the frames that an environment delivers, at the size that points are made of.
 
@@ -354,7 +314,6 @@ class SAM2ActProcessor(PolicyProcessor):
     # Batches
 
     def item(self, sample: Recorded) -> dict[str, Any]:
-        """A run of keyframes without a batch axis, for `collate`."""
         clouds = [cloud_of(shots, self.side) for shots in sample.shots]
         targets = np.asarray(sample.targets, np.float32)
         states = [self.commanded_state(bool(o), int(p)) for o, p in zip(sample.open, sample.places, strict=True)]
@@ -392,16 +351,6 @@ class SAM2ActProcessor(PolicyProcessor):
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
         }
-
-    @classmethod
-    def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
-        """Read what `save` wrote.
-
-        Args:
-            folder: of a checkpoint, which may be untrusted.
-            tokenizer: the folder of a CLIP, in place of what `processor.json` names.
-        """
-        return load_with_goal_encoder(cls, NAME, Path(folder), tokenizer, trusted=(HASHED,))
 
 
 def _neutral(width: int) -> QuantileStats:

@@ -63,10 +63,6 @@ class ImageEncoder(nn.Module):
         fine, middle, coarse = self.vision(scaled).fpn_hidden_states
         return self.fine(fine), self.middle(middle), coarse
 
-    def frozen(self) -> list[nn.Parameter]:
-        """What the authors never train: all but the adapters and the two small convolutions."""
-        return [value for name, value in self.vision.named_parameters() if "linear_" not in name]
-
 
 def _vision_model(sizes: EncoderSizes, side: int) -> Any:
     try:

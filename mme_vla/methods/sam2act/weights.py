@@ -108,11 +108,6 @@ def released_copies(names: Iterable[str]) -> dict[str, str]:
     return {f"{branch}.{name}": name for name in names if name.startswith(IMAGE_PREFIX) for branch in BRANCHES}
 
 
-def released_constants(width: int) -> list[Derived]:
-    """The rates of the rotation bins' codes, which checkpoints hold, for features of a width."""
-    return [Derived(RATES, lambda: code_rates(width)[None])]
-
-
 def released_unread(width: int = 256) -> list[Unread]:
     """What SAM2 brings along and nothing here reads: prompt encoder, mask decoder, object pointers.
 
@@ -220,12 +215,8 @@ def sam2act_adapter(policy: Policy) -> Adapter:
     table = released_names(policy.backbone.state_dict(), sizes.mask_stages)
     unread = released_unread(sizes.encoder.neck)
     originals = [piece.path for pieces in table.values() for piece in pieces] + [gap.path for gap in unread]
-    return Adapter(
-        prefixed("backbone", table),
-        unread,
-        released_copies(originals),
-        released_constants(sizes.feature),
-    )
+    rates = Derived(RATES, lambda: code_rates(sizes.feature)[None])  # of the rotation bins' codes
+    return Adapter(prefixed("backbone", table), unread, released_copies(originals), [rates])
 
 
 def write_sam2act(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:

@@ -63,6 +63,14 @@ class ContinuedDeltaNet(Qwen3_5GatedDeltaNet):
         return output
 
 
+class AttentionCache(DynamicCache):
+    """The cache of a language model without delta nets: transformers requests their state of any."""
+
+    def has_previous_state(self, layer_idx: int | None = None) -> bool:
+        """False: there is none."""
+        return False
+
+
 class WordIds(NamedTuple):
     """What ends a response: the id of `<|im_end|>`, and of the line break behind it."""
 
@@ -145,7 +153,8 @@ class VideoLanguageModel(nn.Module):
     def new_cache(self) -> Any:
         """An empty cache of the language model."""
         config: Any = self.model.config.text_config
-        return DynamicCache(config=config)
+        kind = DynamicCache if "linear_attention" in config.layer_types else AttentionCache
+        return kind(config=config)
 
     def logits(self, hidden: Tensor) -> Tensor:
         """Logits [..., vocabulary] float32 of hidden states [..., D]."""

@@ -98,7 +98,9 @@ class SubtaskDecoder(nn.Module):
         words = torch.cat([self.begin.expand(len(ids), -1, -1), self.words(ids)], 1)
         words = words + self.places[:, : words.shape[1]]
         causal = torch.ones(words.shape[1], words.shape[1], dtype=torch.bool, device=ids.device).triu(1)
-        states: Tensor = self.layers(words, self.context(context), tgt_mask=causal, memory_key_padding_mask=~mask)
+        states: Tensor = self.layers(
+            words, self.context(context), tgt_mask=causal, memory_key_padding_mask=~mask, tgt_is_causal=True
+        )
         return states
 
     def logits(self, hidden: Tensor) -> Tensor:
@@ -155,7 +157,10 @@ class SubtaskPolicy(MMEPolicy):
         return torch.cat([block.tokens for block in blocks], 1), torch.cat([block.mask for block in blocks], 1)
 
     def forward(self, batch: Batch, *args: Any, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
-        """The action's loss under the recorded words, and the weighted cross entropy of these."""
+        """The action's loss under the recorded words, and the weighted cross entropy of these.
+
+        Each word's counts as much as its sample (`Batch.weight`).
+        """
         if not isinstance(batch, SubtaskBatch) or batch.words is None or batch.words_mask is None:
             raise ValueError("forward() computes a loss: the batch must hold the words of its sub-tasks.")
         if batch.words.shape[1] > self.subtask.longest + 1:
@@ -166,8 +171,10 @@ class SubtaskPolicy(MMEPolicy):
         with self.autocast():
             hidden = self.subtask.hidden(*self._context(batch), batch.words)
             logits = self.subtask.logits(hidden[:, :-1])
-        words = functional.cross_entropy(logits[batch.words_mask], batch.words[batch.words_mask])
-        memory = MemoryTokens(hidden[:, 1:], batch.words_mask)
+        mask = batch.words_mask
+        losses = functional.cross_entropy(logits.transpose(1, 2), batch.words, reduction="none") * mask
+        words = (losses if batch.weight is None else losses * batch.weight[:, None]).sum() / mask.sum()
+        memory = MemoryTokens(hidden[:, 1:], mask)
         action, metrics = super().forward(batch, *args, **{**options, "memory": memory})
         loss = action + self.subtask_weight * words
         return loss, {**metrics, "loss": loss.detach(), "action": action.detach(), "words": words.detach()}

@@ -17,10 +17,10 @@ from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps,
 from mme_vla.subgoal.models.qwen3vl import IMAGE_TOKENS, TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.text import (
     BBOX,
+    MEMER_SYSTEM,
     Point,
     mark_points,
     memer_reply,
-    memer_system,
     memer_user,
     subgoal_system,
     subgoal_user,
@@ -122,7 +122,7 @@ def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
     for window in windows(labels, targets, one_a_window=not options.second_keyframe):
         subtask, points = mark_points(labels.texts(kind)[window.frames[-1]])
         user = memer_user(labels.goal, len(window.past), len(window.frames), video=labels.exec_start > 0)
-        texts = (memer_system(), user, memer_reply(subtask, window.positions))
+        texts = (MEMER_SYSTEM, user, memer_reply(subtask, window.positions))
         yield texts, points, [*window.past, *window.frames]
 
 

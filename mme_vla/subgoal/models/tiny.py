@@ -101,11 +101,3 @@ def make_tiny(seed: int = 0) -> tuple[Any, Any]:
     model.generation_config.eos_token_id = processor.tokenizer.eos_token_id
     model.generation_config.pad_token_id = processor.tokenizer.pad_token_id
     return model.eval(), processor
-
-
-def save_tiny(folder: Path, seed: int = 0) -> Path:
-    """Write both as a folder that loads like any other Qwen3-VL."""
-    model, processor = make_tiny(seed)
-    model.save_pretrained(folder)
-    processor.save_pretrained(folder)
-    return folder

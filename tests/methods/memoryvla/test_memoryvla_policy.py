@@ -97,7 +97,7 @@ def test_actions_repeated_past_the_end_count_only_where_they_are_requested(monke
     counted = batch.action_mask[batch.valid].tile(policy.sizes.repeats, 1)
     assert 0 < counted.sum() < counted.numel()
     losses = torch.rand(counted.shape, generator=torch.Generator().manual_seed(0))
-    monkeypatch.setattr(policy.core, "copies_error", lambda *_: losses)
+    monkeypatch.setattr(policy.core, "noise_error", lambda *_: losses)
     torch.testing.assert_close(policy(baseline)[0], losses.mean())
     expected = torch.stack(
         [row[valid].mean() if valid.any() else row.new_zeros(()) for row, valid in zip(losses, counted, strict=True)]

@@ -18,6 +18,7 @@ from mme_vla.config.composition import compose
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.video import TEMPORAL
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.testing.small import unit_stats
 from mme_vla.training.optim import lr_factors, make_optimizer
@@ -209,6 +210,31 @@ def test_lora_trains_adapters_of_the_language_model_and_the_head() -> None:
     loss, _ = policy.train()(batch)
     loss.backward()
     assert all(p.grad is not None for name, p in policy.named_parameters() if p.requires_grad and "lora_B" in name)
+
+
+def test_a_language_model_without_delta_nets_generates() -> None:
+    policy = small(**{"backbone.vlm.text_config.full_attention_interval": 1})
+    episode = policy.start_episode("pick up the cube", seed=1)
+    observe(episode, *observations(20), 0, 20)
+    assert np.isfinite(policy.act(episode)).all()
+
+
+@pytest.mark.slow
+def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone(tmp_path: Path) -> None:
+    words = [*WORDS, *RUN, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
+             "train.warmup=2"]  # fmt: skip
+    trained = Policy.from_pretrained(run("simplememvla", tmp_path / "run", *words, short=[]))
+    values = losses(tmp_path / "run")
+    assert len(values) == 30 and np.mean(values[-10:]) < 0.95 * np.mean(values[:10])
+    fresh = dict(build_from_config(compose("train", ["model=simplememvla", *words])).named_parameters())
+    weights = {name.replace(".base_layer.", "."): value for name, value in trained.named_parameters()}
+    adapters = {name for name in weights if ".lora_" in name}
+    assert adapters and all(weights[name].any() for name in adapters)
+    changed = {name for name in fresh if not torch.equal(weights[name], fresh[name])}
+    assert changed and all(name.startswith("action_head.") for name in changed)
+    episode = trained.start_episode("pick up the cube", seed=1)
+    observe(episode, *observations(20), 0, 20)
+    assert np.isfinite(trained.act(episode)).all()
 
 
 def test_the_recipe_has_two_learning_rates() -> None:

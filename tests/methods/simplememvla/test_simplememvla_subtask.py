@@ -1,5 +1,6 @@
 """π0.5 with the sub-task channel: it trains, generates words, and its words decide about actions."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,8 @@ import torch
 
 from helpers.prior_vla_runs import losses, run
 from mme_vla import UserError, build_policy
-from mme_vla.methods.simplememvla.subtask import SubtaskPolicy
+from mme_vla.evaluation.rollouts import join
+from mme_vla.methods.simplememvla.subtask import SubtaskBatch, SubtaskPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.types import MemoryTokens
 
@@ -41,6 +43,20 @@ def test_the_hidden_states_of_words_decide_about_actions() -> None:
     custom = policy.sample_actions(batch, noise, 2)
     assert torch.equal(custom, policy.sample_actions(batch, noise, 2, memory=tokens))
     assert not torch.allclose(custom, policy.sample_actions(batch, noise, 2, memory=other))
+
+
+def test_sample_weights_weigh_the_words_too() -> None:
+    policy: Any = build_policy("pi05_subtask", seed=0).eval()
+    one = policy.full_batch()
+    samples = [replace(one, words=torch.full_like(one.words, word)) for word in (1, 2)]
+    noise = policy.training_noise(1, torch.Generator().manual_seed(0))
+    losses = [policy(sample, noise)[1]["words"] for sample in samples]
+    assert losses[0] != losses[1]
+    rows = replace(join(samples), weight=torch.tensor([0.0, 3.0]))
+    words, mask = (torch.cat([getattr(sample, name) for sample in samples]) for name in ("words", "words_mask"))
+    both = SubtaskBatch(**vars(rows), words=words, words_mask=mask)
+    noises = {name: torch.cat([value, value]) for name, value in noise.items()}
+    assert torch.allclose(policy(both, noises)[1]["words"], 1.5 * losses[1])
 
 
 def test_words_end_at_the_limit_or_before() -> None:

@@ -1,28 +1,22 @@
 """What the four Unmask tasks share: containers over cubes, picking them up and putting them down."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Cue, Hide, Swap, planned_swaps, under
-from mme_vla.envs.scene.objects import (
-    COLOURS,
-    CONTAINER_OUTER,
-    Container,
-    Cube,
-    H,
-    build_container,
-    build_hidden_cube,
+from mme_vla.envs.scene.motions import (
+    COVER_STEPS,
+    SWAP_STEPS,
+    Cover,
+    Cue,
+    Hide,
+    Swap,
+    active_motions,
+    planned_swaps,
+    under,
 )
-from mme_vla.envs.scene.placement import (
-    ANCHOR_HALF,
-    Avoid,
-    Draws,
-    Point,
-    Region,
-    SceneError,
-    draw_container,
-)
+from mme_vla.envs.scene.objects import COLOURS, CONTAINER_OUTER, Container, Cube, H, build_container, build_hidden_cube
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Avoid, Draws, Point, Region, SceneError, draw_container
 from mme_vla.envs.scene.predicates import container_picked_up, container_put_down
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
@@ -224,6 +218,9 @@ class Unmask(Task):
     def cues(self) -> list[Cue]:
         return [under(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
 
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        return active_motions(self.covers[:1])
+
     def start_episode(self, draws: Draws) -> None:
         groups = PARKED if self.tier else dict.fromkeys(PARKED)
         self.covers = [Cover(self.containers, groups["inner"]), Cover(self.outer.containers, groups["outer"])]
@@ -317,14 +314,19 @@ class UnmaskSwap(Task):
         """Colours to be found, in order, each with the container over it."""
         return list(zip(self.colours, self.over_cubes, strict=True))[: self.pick_count]
 
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        return active_motions(self.shown)
+
     def start_episode(self, draws: Draws) -> None:
         inner, outer = self.containers, self.outer.containers
         start, steps, end = COVER_STEPS, self.swap_steps, self.swapped_after
         groups = PARKED if self.tier else dict.fromkeys(PARKED)
         nearest = [Swap(thing, inner, start + i * steps, steps=steps) for i, thing in enumerate(self.initiators)]
         swaps = nearest if self.pairs is None else planned_swaps(self.pairs, inner, start, steps)
+        cover = Cover(inner, groups["inner"])
+        self.shown: list[Cover | Swap] = [cover, *swaps]
         self.motions: list[Cover | Swap | Hide] = [
-            Cover(inner, groups["inner"]),
+            cover,
             Cover(outer, groups["outer"]),
             *swaps,
             *planned_swaps(self.outer_pairs, outer, start, steps),

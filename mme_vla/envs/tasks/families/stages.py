@@ -1,6 +1,6 @@
 """Sub-tasks and placements that several tasks share."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -126,6 +126,11 @@ def pick(env: Task, cube: Cube, text: str, choice: str = "a", **options: Any) ->
         choice=choice,
         **{"grounded": text.replace("cube", "cube at <>", 1), **options},
     )
+
+
+def choices_made(ended: Mapping[int, SubTask], letters: str, video: bool) -> set[str]:
+    """Of the sub-tasks that have ended, those of the video or of the execution that are one of some options."""
+    return {f"{i} {s.text}" for i, s in ended.items() if s.choice and s.choice in letters and s.video == video}
 
 
 def delay(env: Task) -> int:

@@ -1,11 +1,12 @@
 """What the two VideoPlace tasks share: a cube is carried over targets in the video; put it on one of them again."""
 
 from abc import abstractmethod
+from collections.abc import Collection, Mapping
 from typing import ClassVar
 
 import sapien
 
-from mme_vla.envs.scene.motions import Cue, Swap, under
+from mme_vla.envs.scene.motions import Cue, Swap, active_motions, under
 from mme_vla.envs.scene.objects import Cube, Disc, H
 from mme_vla.envs.scene.placement import Avoid, Draws, Region
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, dropped_onto
@@ -17,6 +18,7 @@ from mme_vla.envs.tasks.families.stages import (
     add_cube,
     add_target,
     check_colour,
+    choices_made,
     cube_names,
     delay,
     end_video,
@@ -117,6 +119,10 @@ class VideoPlace(Task):
 
     def cues(self) -> list[Cue]:
         return [under(self.goal_target)]
+
+    def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
+        swap = [] if self._swap is None else [self._swap]
+        return choices_made(ended, "bc", video=True) | active_motions(swap)
 
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong to the stages."""

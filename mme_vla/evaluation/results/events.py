@@ -1,0 +1,84 @@
+"""Runs with events beside their matched arms, the same scenes and noise without: pairs, and success over length."""
+
+from collections.abc import Sequence
+
+from mme_vla.errors import require
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
+from mme_vla.evaluation.results.aggregate import Method, Results, sign_test
+from mme_vla.evaluation.results.compare import show_p
+from mme_vla.evaluation.results.curves import Curves, Place, curves_of
+from mme_vla.evaluation.results.tables import Table
+from mme_vla.evaluation.rollout.events import split_words
+from mme_vla.registry import EVENTS
+
+Pair = tuple[EpisodeRecord, EpisodeRecord]
+"""An episode's record under an event, and the plain one."""
+NO_EVENTS = "None of these records is of an event: evaluate with event=pause:100, for instance."
+
+
+def matched_methods(results: Results) -> list[tuple[Method, Method]]:
+    """Every method with an event and the same one without, where there is one."""
+
+    def identity(method: Method) -> tuple[object, ...]:
+        names = ("model", "subgoal", "memory_budget", "composition", "recipe", "data")
+        return tuple(getattr(method, name) for name in names)
+
+    plain = {identity(method): method for method in results.methods if method.event is None}
+    return [(m, plain[identity(m)]) for m in results.methods if m.event is not None and identity(m) in plain]
+
+
+def matched_pairs(records: Sequence[EpisodeRecord]) -> dict[RunKey, list[Pair]]:
+    """The pairs of every run with events; an episode that ended in an error has none.
+
+    records: merged, of both arms.
+    """
+    there: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {(r.run, r.key): r for r in records if r.outcome != "error"}
+    pairs: dict[RunKey, list[Pair]] = {}
+    for (run, key), record in there.items():
+        plain = there.get((run._replace(event=None), key))
+        if run.event is not None and plain is not None:
+            pairs.setdefault(run, []).append((record, plain))
+    return pairs
+
+
+def did_not_act(record: EpisodeRecord) -> list[str]:
+    """The events of a record whose place never came: a sub-task that did not begin, a step beyond the end."""
+    return [entry["event"] for entry in record.extra.get("events", ()) if entry["step"] is None]
+
+
+def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
+    """Of every run with events and task: both success rates, and which outcomes the event changed."""
+    merged = merge(records, conflicts)
+    require(any(record.event for record in merged), NO_EVENTS)
+    rows, rules = [], set()
+    for run, pairs in matched_pairs(merged).items():
+        tasks = list(dict.fromkeys(record.task for record, _ in pairs))
+        for task in [*tasks, *(["all"] if len(tasks) > 1 else [])]:
+            there = [pair for pair in pairs if task in ("all", pair[0].task)]
+            rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(there)])
+        rules.add(len(rows))
+    columns = ["run", "event", "task", "pairs", "without (%)", "with (%)", "kept", "lost", "gained", "p", "did not act"]
+    return Table("Events beside their matched arms", columns, rows, rules - {len(rows)})
+
+
+def _counts(pairs: Sequence[Pair]) -> list[str]:
+    kept = sum(record.success and plain.success for record, plain in pairs)
+    lost = sum(plain.success and not record.success for record, plain in pairs)
+    gained = sum(record.success and not plain.success for record, plain in pairs)
+    rates = [f"{100 * count / len(pairs):.1f}" for count in (kept + lost, kept + gained)]
+    idle = sum(bool(did_not_act(record)) for record, _ in pairs)
+    return [str(len(pairs)), *rates, str(kept), str(lost), str(gained), show_p(sign_test(lost, gained)), str(idle)]
+
+
+def event_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
+    """Success over the number of every event that has one; the plain run is at its neutral number."""
+    return curves_of(merge(records, conflicts), _place, confidence)
+
+
+def _place(record: EpisodeRecord) -> Place | None:
+    words = None if record.event is None else split_words(record.event)
+    if words is None or words.value is None:
+        return None
+    neutral = EVENTS[words.name].neutral if words.name in EVENTS else 0
+    dial = words.name if words.unit is None else f"{words.name}@{words.unit}:{words.number}"
+    return Place(record.run._replace(event=None), dial, words.value, neutral)

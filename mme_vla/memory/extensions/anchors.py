@@ -1,0 +1,49 @@
+"""Anchors: the first frame and the last ones, the floor that a memory has to exceed.
+
+After the anchors of EventVLA, which keeps frame 0 and two frames of the last second beside its keyframes. There is
+nothing here that decides what to write, so any memory that does is compared with it.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import check_sizes
+from mme_vla.memory.base import PerceptualMemory
+from mme_vla.memory.extensions.attending import FrameMemory
+from mme_vla.memory.framesamp import whole_frames
+from mme_vla.memory.history import StorageSpec
+from mme_vla.registry import MEMORIES
+
+
+@MEMORIES.register("anchors")
+class Anchors(FrameMemory, PerceptualMemory):
+    """The first frame, and `budget / grid² − 1` frames back from the current one."""
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        budget: int = 48,
+        *,
+        grid: int = 4,
+        pooling: str = "mean",
+        spacing: int = 1,
+        **encoder: Any,
+    ) -> None:
+        """See `PerceptualMemory`.
+
+        Args:
+            budget: memory tokens; 48 hold the first frame and the last two.
+            grid, pooling: a frame is grid×grid tokens.
+            spacing: frames between two of the last ones, of which the current frame is one.
+        """
+        check_sizes("memory", spacing=spacing)
+        frames = whole_frames(budget, grid, at_least=2)
+        super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
+        self.recent, self.spacing = frames - 1, spacing
+
+    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+        """Frame 0 and the last ones, ascending."""
+        last = step - self.spacing * np.arange(self.recent)
+        return np.union1d([0], last[last > 0])

@@ -1,0 +1,128 @@
+"""Keyframes: a write head says at which frames a sub-task begins, and these frames are kept whole (EventVLA).
+
+After EventVLA, whose head predicts keyframes from the hidden state of an action chunk, keeps those that are certain
+enough beside a few anchors, and suppresses neighbours. A memory here stands before the language model, so that the head
+reads what a frame looks like and how it differs from the stored frame before it. What it learns from are the sub-tasks
+of the dataset: a stored frame is a keyframe where a sub-task has begun since the stored frame before it. Without
+labels, as in nano, the action loss alone teaches it, through a straight-through sigmoid as in `learned_topk`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mme_vla.errors import check_sizes, require
+from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
+from mme_vla.memory.extensions.attending import by_frame, rows_at
+from mme_vla.memory.framesamp import evenly_spaced_frames, whole_frames
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.recurrent import default_hidden, full_precision, linear
+from mme_vla.registry import MEMORIES
+from mme_vla.types import HistoryTokens, MemoryTokens, ReadsLabels
+
+LABEL = "subtask_index"
+LOWEST = 1e4  # beyond any score
+
+
+@MEMORIES.register("keyframes")
+class Keyframes(PerceptualMemory, ReadsLabels):
+    """The first frame, the newest stored one, and `budget / grid² − 2` that the head is most certain of."""
+
+    reads_labels = (LABEL,)
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        budget: int = 256,
+        *,
+        grid: int = 4,
+        pooling: str = "mean",
+        every: int = 8,
+        pool: int = 80,
+        hidden: int | None = None,
+        **encoder: Any,
+    ) -> None:
+        """See `PerceptualMemory`.
+
+        Args:
+            grid, pooling: a frame is grid×grid tokens.
+            every: frames 0 and k·every − 1 can be kept. pool: most of them that the head reads, evenly spaced.
+            hidden: width of the head; None is a quarter of `d_vision`, at least 64.
+        """
+        check_sizes("memory", every=every, pool=pool)
+        frames = whole_frames(budget, grid, at_least=3)
+        require(
+            frames <= pool, f"memory.pool={pool}: the frames of memory.budget={budget} are {frames}, so at least that."
+        )
+        super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
+        hidden = default_hidden(d_vision, hidden)
+        self.frames, self.pool, self.capacity = frames, pool, pool * grid**2
+        self.read, self.write = nn.Linear(2 * d_vision, hidden), nn.Linear(hidden, 1)
+
+    def chosen(self, step: int) -> np.ndarray:
+        """The frames that the head reads at `step`, ascending, the newest stored one among them."""
+        stored = self.storage.stored_frames(step + 1)
+        return stored[evenly_spaced_frames(len(stored) - 1, self.pool)]
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return union_frames([self.chosen(int(step)) for step in steps])
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        """The candidates: `forward` keeps some of them."""
+        return all_patches(self.chosen(step), self.storage.grid)
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        patches = self.storage.grid**2
+        valid = by_frame(history.mask, patches)[..., 0]
+        scores = self.scores(history.features)
+        kept = self.kept(scores, valid)
+        tokens = (kept[..., None] * patches + torch.arange(patches, device=kept.device)).flatten(1)
+        features, positions, mask = (
+            rows_at(part, tokens) for part in (history.features, history.positions, history.mask)
+        )
+        # One in the forward pass, the sigmoid in the backward pass.
+        worth = rows_at(scores, kept).sigmoid()
+        worth = (worth + (1 - worth).detach()).repeat_interleave(patches, 1)
+        encoded = self.encoder(features, positions, mask)
+        ages = None if history.ages is None else rows_at(history.ages, tokens)
+        losses = {}
+        if LABEL in history.labels:
+            losses["write"] = write_loss(scores, by_frame(history.labels[LABEL], patches)[..., 0], valid)
+        return MemoryTokens(encoded * worth[..., None].to(encoded.dtype), mask, ages=ages, losses=losses)
+
+    def scores(self, features: Tensor) -> Tensor:
+        """Logits [b, t] float32: whether a sub-task has begun since the frame before; features [b, t·p, d]."""
+        with full_precision(features):
+            means = by_frame(features.float(), self.storage.grid**2).mean(2)
+            change = torch.diff(means, dim=1, prepend=means[:, :1])
+            return linear(self.write, functional.silu(linear(self.read, torch.cat([means, change], -1))))[..., 0]
+
+    def kept(self, scores: Tensor, valid: Tensor) -> Tensor:
+        """Which frames are kept: int64 [b, frames], ascending, padding last.
+
+        Highest scores first, those lower than a neighbour's after all others. The first frame and the newest in any
+        case.
+        """
+        ranks = scores.detach().masked_fill(~valid, -2 * LOWEST)
+        highest = functional.max_pool1d(ranks[:, None], 3, 1, 1)[:, 0]
+        ranks = ranks - LOWEST * (ranks < highest)
+        newest = valid.sum(1, keepdim=True) - 1
+        ranks = ranks.scatter(1, torch.cat([torch.zeros_like(newest), newest], 1), LOWEST)
+        return ranks.topk(self.frames, dim=1).indices.sort(1).values
+
+
+def write_loss(scores: Tensor, subtask: Tensor, valid: Tensor) -> Tensor:
+    """Cross-entropy [b] of logits [b, t], the mean over keyframes and that over other frames counting alike.
+
+    Args:
+        subtask: the number of each frame's sub-task, [b, t]. valid: bool [b, t].
+    """
+    begins = torch.diff(subtask, dim=1, prepend=subtask[:, :1]).ne(0)
+    losses = functional.binary_cross_entropy_with_logits(scores, begins.to(scores.dtype), reduction="none")
+    sides = [(losses * side).sum(1) / side.sum(1).clamp(min=1) for side in (begins & valid, ~begins & valid)]
+    return (sides[0] + sides[1]) / 2

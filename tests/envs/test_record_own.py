@@ -1,0 +1,60 @@
+"""Recording an environment of the user's own: an interrupted command continues, and says when it cannot."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from helpers import REPOSITORY
+from mme_vla.cli.record import record_environment
+from mme_vla.config.plugins import import_plugins
+from mme_vla.envs.base import environment
+from mme_vla.errors import UserError
+from mme_vla.utils import read_json
+
+pytest.importorskip("lerobot", reason="writes a LeRobot dataset: uv sync --inexact --extra data")
+
+
+@pytest.fixture
+def demonstrated(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Number of each demonstration of examples/blink; the third one is interrupted."""
+    monkeypatch.syspath_prepend(REPOSITORY / "examples" / "blink")
+    import_plugins(["blink"])
+    numbers: list[int] = []
+    kind = type(environment("blink"))
+    demonstrate = kind.demonstrate
+
+    def interrupted(self: Any, env: Any) -> Iterator[np.ndarray]:
+        numbers.append(len(numbers))
+        if len(numbers) == 3:
+            raise KeyboardInterrupt
+        yield from demonstrate(self, env)
+
+    monkeypatch.setattr(kind, "demonstrate", interrupted)
+    return numbers
+
+
+def test_an_interrupted_recording_continues_with_the_missing_episodes(demonstrated: list[int], tmp_path: Path) -> None:
+    words = {
+        "env": "blink",
+        "tasks": "all",
+        "task": None,
+        "split": "train",
+        "output": str(tmp_path / "data"),
+        "fps": 20,
+    }
+    config = OmegaConf.create({**words, "episodes": 4})
+    with pytest.raises(KeyboardInterrupt):
+        record_environment(config)
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(UserError, match="interrupted recording of other episodes"):
+        record_environment(OmegaConf.create({**words, "episodes": 2}))
+    record_environment(config)
+    assert len(demonstrated) == 5  # three, and the two that were missing
+    assert read_json(tmp_path / "data" / "meta" / "info.json", "a dataset")["total_episodes"] == 4
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+    with pytest.raises(UserError, match="exists already"):
+        record_environment(config)
