@@ -202,7 +202,7 @@ def run_episodes(
     kind = subgoal_kind(policy)
     subgoals = None if kind is None else build_predictor({"name": ORACLE, "kind": kind.removesuffix("_subgoal")})
     settings = RolloutSettings.from_config({
-        "seed": rules.seed, "split": rules.split, "max_steps": rules.max_steps, "workers": rules.workers,
+        "seed": rules.seed, "split": rules.split, "max_steps": rules.steps, "workers": rules.workers,
         "max_actions": rules.max_choices, "only_possible": rules.only_possible, "video": video,
     })  # fmt: skip
     facts = facts_of(policy, None, str(checkpoint), settings, None if subgoals is None else ORACLE)

@@ -219,7 +219,7 @@ def films(
 
 def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
     """How many demonstrations of each task and difficulty."""
-    counts = {}
+    counts: dict[tuple[str, str], int] = {}
     for task in choose_tasks(config["task"]):
         wanted = {**config["demonstrations"], **config["demonstrations_of"].get(task, {})}
         fits = set(wanted) <= set(LEVELS) and all(isinstance(n, int) and n >= 0 for n in wanted.values())

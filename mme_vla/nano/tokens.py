@@ -159,7 +159,7 @@ class TokenStore:
         path = self.path(file)
         if not path.is_file():
             return False
-        with safe_open(path, "pt") as tensors:  # type: ignore[no-untyped-call]
+        with safe_open(path, "pt") as tensors:
             scored = {name.removeprefix("scores/") for name in tensors.keys() if name.startswith("scores/")}  # noqa: SIM118
             wanted = {_memory(text).storage.scorer for text in self.memories}
             return bool(tensors.metadata().get("stamp") == stamp) and wanted <= scored

@@ -211,7 +211,7 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
     assert code == case.code and case.says in output, output[-3000:]
     if case.words.endswith(NANO):  # run again, it computes nothing twice
         nano = folder / "nano"
-        records = read_folders(find_records([nano / "val" / "framesamp_modul"]))
+        records = read_folders(find_records([nano / "further" / "framesamp_modul"]))
         assert sorted(record.episode for record in records) == [0, 1]
         assert {record.action_space for record in records} == {"waypoint"}
         page = (nano / "page.md").read_text()
@@ -221,7 +221,7 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
         saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
         assert run(case, folder)[0] == 0
         assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == saved
-        assert len(read_folders(find_records([nano / "val" / "framesamp_modul"]))) == 2
+        assert len(read_folders(find_records([nano / "further" / "framesamp_modul"]))) == 2
 
 
 @pytest.mark.slow

@@ -49,7 +49,8 @@ def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
     for name in ("features", "positions", "mask"):
         here, there = getattr(history, name).float(), getattr(batch.history, name)[0].float()
         there = there[-len(here) :]  # later decisions read more frames, so that this one is padded on the left
-        assert torch.allclose(here, there, atol=0.01)  # encoded in other batches, and kept as bfloat16
+        # Resized from noise by Pillow and by PyTorch, encoded in other batches, and kept as bfloat16.
+        assert torch.allclose(here, there, atol=0.05)
 
 
 @pytest.mark.parametrize(("model", "words"), [("simplesg", "pick it up"), ("groundsg", "pick it up at <")])

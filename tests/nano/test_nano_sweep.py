@@ -50,15 +50,14 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
         ]  # fmt: skip
 
     monkeypatch.setattr(evaluating, "run_episodes", episodes)
-    words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul,tokendrop_modul", "budget=2,4"])
+    words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul", "budget=2,4"])
     words += ["trainings=2", "beside=[]", "drawn_for=[]", "planner=false", "films=false", f"output={tmp_path / 'run'}"]
     words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]
     page = runs.run(resolved(compose("nano", words))).read_text()
     assert len(recorded) == 1 and len(made) == 2, "each frame is encoded once"
-    for name in ("framesamp_modul-every_8-grid_1", "tokendrop_modul-grid_1"):
-        assert all(f"| {name} | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
+    assert all(f"| framesamp_modul-every_8-grid_1 | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
     trained = sorted((tmp_path / "run").glob("training/*/*/trained.json"))
-    assert len(trained) == 8
+    assert len(trained) == 4
     seeds = [identity_of(MMEPolicy.from_pretrained(str(tmp_path / "run" / "training" / "framesamp_modul@2" / n)).config)
              for n in "01"]  # fmt: skip
     assert [one and one.seed for one in seeds] == [0, 1] and seeds[0] != seeds[1]

@@ -75,8 +75,7 @@ class RunningEpisode:
         """Take the first observation: a conditioning video, if the task has one, and the current frame."""
         goal = str(info["task_goal"][0])
         self.episode.goal = goal
-        if self._robot.action.choice and OPTIONS in info:
-            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
+        self._offer(info)
         length = len(frames["state"])
         frames = self._observed(frames, length, np.append(self.events.video(length - 1), length - 1))
         self.video_frames = len(frames["state"]) - 1
@@ -88,6 +87,7 @@ class RunningEpisode:
 
     def resume(self, frames: Observation, info: dict[str, Any]) -> None:
         """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
+        self._offer(info)
         count, length = self._count(info), len(frames["state"])
         if self.events.holding is not None:
             self.events.held += length
@@ -107,6 +107,11 @@ class RunningEpisode:
     def unobserved(self) -> int:
         """Frames of the environment that events withheld so far; below 0 where they repeated some."""
         return self._simulated - len(self._shown)
+
+    def _offer(self, info: dict[str, Any]) -> None:
+        """Let the episode choose among the options of now: which of them are possible may change."""
+        if self._robot.action.choice and OPTIONS in info:
+            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
 
     def end(self, info: dict[str, Any]) -> None:
         """Take the report of the last actions; their frames are not needed any more."""
