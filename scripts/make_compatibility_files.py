@@ -338,9 +338,8 @@ def dataset_figures(folder: Path, name: str) -> list[str]:
 
 
 def nano_tower() -> str:
-    """A hash of the vision tower that ships with the library, as caches depend on it."""
-    policy = mme_vla.build_policy("framesamp_modul", backbone="nano")
-    return str(policy.vision_fingerprint())
+    """A hash of the vision tower of the shipped checkpoint, as caches depend on it."""
+    return str(mme_vla.MMEPolicy.from_pretrained("nano").vision_fingerprint())
 
 
 def tidy(folder: Path) -> None:

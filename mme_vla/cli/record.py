@@ -1,10 +1,7 @@
 """`mme-vla record`: demonstrate episodes of the benchmark and keep them as a dataset."""
 
-import gc
-import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -12,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 
-from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import ROBOMME, make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
 from mme_vla.envs.recording.own import record_own
+from mme_vla.envs.recording.processes import carry_out, simulation_pool
 from mme_vla.envs.rows import task_options
-from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError, require
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
-from mme_vla.utils.processes import end_with_parent, signals_deferred
+from mme_vla.utils.processes import signals_deferred
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -116,11 +112,6 @@ def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | Non
     return [read_json(folder / f"{job.name}.json", "what is known of a recorded episode") for job in jobs]
 
 
-def _pool(workers: int) -> ProcessPoolExecutor:
-    begun = (settings(), _begin_worker, imported_plugins())
-    return ProcessPoolExecutor(workers, simulating_processes(), begin, begun)
-
-
 def report_coverage(
     tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int, split: str = "test"
 ) -> None:
@@ -134,7 +125,7 @@ def report_coverage(
     specs, goals = choose_episodes(tasks, None, split), []
     with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
         with signals_deferred():
-            run = map if workers == 1 else stack.enter_context(_pool(workers)).map
+            run = map if workers == 1 else stack.enter_context(simulation_pool(workers)).map
             episode_goals = run(goal_of, specs)
         for goal in episode_goals:
             goals.append(goal)
@@ -143,37 +134,6 @@ def report_coverage(
     coverage = compare(goals_recorded(plan.dataset, official), zip(specs, goals, strict=True))
     write_json(file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1)
     print(f"{in_words(coverage, split)}\n{file}")
-
-
-def _begin_worker(plugins: Sequence[str]) -> None:
-    """A worker process ends with the one that started it, and knows the same tasks."""
-    end_with_parent()
-    import_plugins(plugins)
-
-
-def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
-    """Do work that simulates, in so many processes; what came of it, as it is done.
-
-    work: importable by name, or a partial of such, where there are several processes.
-    """
-    if workers == 1 or len(jobs) < 2:
-        import mme_vla.envs.task  # noqa: F401
-
-        gc.freeze()  # scenes are built faster when no collection walks through the simulator's modules
-        yield from map(work, jobs)
-        return
-    with _pool(workers) as pool:
-        with signals_deferred():  # the workers are started here, and inherit that
-            futures = [pool.submit(work, job) for job in jobs]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException as error:
-            pool.shutdown(wait=False, cancel_futures=True)
-            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: it is not awaited
-                for worker in multiprocessing.active_children():
-                    worker.terminate()
-            raise
 
 
 def plan(cfg: "DictConfig") -> list[Job]:

@@ -166,7 +166,7 @@ def play_all(
     name: str, folder: Path, specs: Sequence[EpisodeSpec], rules: Rules, moves: Mapping[str, Any]
 ) -> list[EpisodeRecord]:
     """A row that nothing was trained for: plays what `folder` has no record of yet; its records of these episodes."""
-    from mme_vla.cli.record import carry_out
+    from mme_vla.envs.recording.processes import carry_out
 
     settings = {**asdict(rules), "model": name, "max_steps": rules.steps}
     del settings["workers"], settings["shard"]
@@ -246,7 +246,7 @@ def built_scenes(
 
     file: keeps both, so that they are looked for once.
     """
-    from mme_vla.cli.record import carry_out
+    from mme_vla.envs.recording.processes import carry_out
 
     require(isinstance(count, int), f"episodes={count}: with replace=true write how many scenes of each task.")
     known: dict[str, str] = read_json(file, "the scenes of a split")["tried"] if file.is_file() else {}

@@ -35,7 +35,7 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
 
     config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
     """
-    from mme_vla.cli.record import carry_out
+    from mme_vla.envs.recording.processes import carry_out
     from mme_vla.nano.fitting import train_in_process
     from mme_vla.nano.page import write_page
     from mme_vla.nano.tokens import TokenStore
@@ -290,8 +290,8 @@ class Group:
 
 def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     """The files of the first demonstrations of each group that succeed; existing ones are not made again."""
-    from mme_vla.cli.record import carry_out
     from mme_vla.data.console import progress
+    from mme_vla.envs.recording.processes import carry_out
     from mme_vla.nano.demonstrations import demonstrated
 
     with progress("record", sum(group.required for group in groups), unit="demonstrations") as advance:

@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from torch import Tensor
 
 from mme_vla.errors import require
 from mme_vla.memory.base import frames_scored, make_scorer
 from mme_vla.memory.history import FrameScores
 from mme_vla.nano.demonstrations import Demonstration
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.registry import MEMORIES
 from mme_vla.utils import write_atomically
 
@@ -167,9 +169,7 @@ class TokenStore:
 
 @cache
 def _policy(config: str) -> MMEPolicy:
-    from mme_vla.nano.fitting import build
-
-    return build(json.loads(config)).eval()
+    return mme_of(build_from_config(OmegaConf.create(json.loads(config))), "nanoMME").eval()
 
 
 @cache

@@ -1,0 +1,47 @@
+"""Work that simulates, in processes of its own."""
+
+import gc
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+
+from mme_vla.config.plugins import import_plugins, imported_plugins
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
+from mme_vla.utils.processes import end_with_parent, signals_deferred
+
+
+def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
+    """Do work that simulates, in so many processes; what came of it, as it is done.
+
+    work: importable by name, or a partial of such, where there are several processes.
+    """
+    if workers == 1 or len(jobs) < 2:
+        import mme_vla.envs.task  # noqa: F401
+
+        gc.freeze()  # scenes are built faster when no collection walks through the simulator's modules
+        yield from map(work, jobs)
+        return
+    with simulation_pool(workers) as pool:
+        with signals_deferred():  # the workers are started here, and inherit that
+            futures = [pool.submit(work, job) for job in jobs]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException as error:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: it is not awaited
+                for worker in multiprocessing.active_children():
+                    worker.terminate()
+            raise
+
+
+def simulation_pool(workers: int) -> ProcessPoolExecutor:
+    """Processes that simulate, end with this one, and know the same plugins."""
+    begun = (settings(), _begin_worker, imported_plugins())
+    return ProcessPoolExecutor(workers, simulating_processes(), begin, begun)
+
+
+def _begin_worker(plugins: Sequence[str]) -> None:
+    """A worker process ends with the one that started it, and knows the same tasks."""
+    end_with_parent()
+    import_plugins(plugins)
