@@ -348,7 +348,7 @@ class RoboMMEEnv(gymnasium.Env):
         run.truncated = torch.tensor(self._timed_out(run))
 
     def _hold(self, run: _Run, steps: int) -> None:
-        """Repeat the last command, while the scene goes on, until the episode ends."""
+        """Repeat the last command, while the scene continues, until the episode ends."""
         run.hold_steps += steps
         for left in reversed(range(steps)):
             run.control.demonstrator.left = left  # the last one's frame is the newest

@@ -13,8 +13,8 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, holm, percentiles, resampled_means
-from mme_vla.evaluation.results.compare import Comparison, compare, compare_all
+from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, percentiles, resampled_means
+from mme_vla.evaluation.results.compare import Comparison, compare, compare_all, holm
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
 from mme_vla.nano.rows import Trained, Training

@@ -202,7 +202,7 @@ def test_a_custom_event_is_registered_by_name(policy: MMEPolicy) -> None:
 
 
 class Rail(gymnasium.Env[Any, Any]):
-    """A cart that is pushed by its action, and a lamp that goes on blinking."""
+    """A cart that is pushed by its action, and a lamp that keeps blinking."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.place, self.time = 0.0, 0

@@ -37,7 +37,7 @@ class Event:
 
     @property
     def hold(self) -> int:
-        """Control steps for which the robot holds its pose and the scene goes on; the step limit grows by as many."""
+        """Control steps for which the robot holds its pose and the scene continues; the step limit grows by as many."""
         return 0
 
     @property
