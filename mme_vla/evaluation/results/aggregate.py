@@ -92,7 +92,7 @@ def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
 
 
 def resampled_means(tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int) -> np.ndarray:
-    """Means over tasks of each method [methods, samples], of episodes sampled within each task, and of sampled trainings.
+    """Means over tasks of each method [methods, samples], of episodes sampled within each task, and of trainings.
 
     tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs of a training: an
     episode is sampled with all of them, for all methods alike. Of one training none is sampled.
