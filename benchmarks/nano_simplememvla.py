@@ -66,8 +66,8 @@ def composed(*words: str) -> dict[str, Any]:
 def record(folder: Path, count: int) -> list[Path]:
     """Demonstrations that succeed, the first so many seeds; existing ones are not made again."""
     config = composed()
-    shown, robot = config["processor"], embodiment_of(config)
-    window = Window(shown["seconds"], shown["fps"], shown["native_fps"])
+    window_section, robot = config["processor"], embodiment_of(config)
+    window = Window(window_section["seconds"], window_section["fps"], window_section["native_fps"])
     choices: Any = (VideoFrames(window),)
     folder.mkdir(parents=True, exist_ok=True)
     scene = Scene(TASK, FIRST_SEED, LEVEL, folder, tuple(robot.camera_names), choices, False, robot.action)
@@ -81,7 +81,7 @@ def decisions(policy: SimpleMemVlaPolicy, files: Sequence[Path]) -> list[dict[st
     for made in map(Demonstration.load, files):
         for place, frame in enumerate(made.motions.decisions.tolist()):
             chunk, recorded = made.motions.chunk(frame, action.horizon)
-            video = np.stack([made.images[camera][shown] for shown in processor.frames(frame).tolist()])
+            video = np.stack([made.images[camera][i] for i in processor.frames(frame).tolist()])
             subtask, none = made.subgoals["simple"][place], np.zeros((0, action.width), np.float32)
             sample = Sample({camera: video}, made.states[frame : frame + 1], made.goal, subtask, none, chunk)
             items.append({**processor.item(sample), "action_mask": torch.from_numpy(recorded)})

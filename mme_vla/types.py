@@ -205,7 +205,7 @@ class Overlap(TensorStruct):
 
 @dataclass
 class PastViews(TensorStruct):
-    """Views of past frames, for a vision tower that looks at them along with the current ones.
+    """Views of past frames, for a vision tower that reads them along with the current ones.
 
     images: [b, k, v, 3, s, s] uint8, oldest first, the current frame not among them; float in [−1, 1] once they are as
         the tower takes them. mask: [b, k] bool; False on frames before the episode's first.
@@ -257,7 +257,7 @@ class Batch(TensorStruct):
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.
 
         Nothing attends to padding and nothing counts it, so the answer is the same and cheaper. Done where batches
-        are made, on the CPU: the network itself never looks at content.
+        are made, on the CPU: the network itself never reads content.
         """
         longest = int(self.prompt_mask.sum(1).max())
         length = min(-(-longest // multiple) * multiple, self.prompt.shape[1])

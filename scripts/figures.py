@@ -100,9 +100,9 @@ def memory(source: EpisodeSource) -> Figure:
         part.suptitle(
             f"{name} at step {length - 1} reads {len(selected)} tokens in {len(frames)} frames: {reads}", fontsize=11
         )
-        chosen = frames[np.linspace(0, len(frames) - 1, min(TILES, len(frames))).round().astype(int)]
-        images = source.frames(EPISODE, chosen)
-        for column, (frame, image) in enumerate(zip(chosen.tolist(), images, strict=True)):
+        steps = frames[np.linspace(0, len(frames) - 1, min(TILES, len(frames))).round().astype(int)]
+        images = source.frames(EPISODE, steps)
+        for column, (frame, image) in enumerate(zip(steps.tolist(), images, strict=True)):
             axes = part.add_subplot(grid[1, column])
             axes.imshow(highlighted(image, selected[selected[:, 0] == frame, 1], built.storage.grid))
             axes.set_title(f"frame {frame}, {counts[frame]} tokens", fontsize=8)
@@ -146,7 +146,7 @@ def budget(source: EpisodeSource) -> Figure:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.4), width_ratios=[1.6, 1], layout="constrained")
     for place, tokens in enumerate(budgets):
         built = FrameSamp(WIDTH, WIDTH, budget=tokens)
-        frames = built.chosen(length - 1)
+        frames = built.selected_frames(length - 1)
         left.plot(frames, np.full(len(frames), place), "|", ms=16, mew=1.6, color="#1f6f8b")
     phases(left, start, length)
     left.set_yticks(range(len(budgets)), [f"{tokens} tokens,\n{tokens // 16} frames" for tokens in budgets], fontsize=8)

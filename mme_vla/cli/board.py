@@ -60,7 +60,7 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     from mme_vla.nano.rows import read_rows
 
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
-    rows = read_rows([SHIPPED / split] if (SHIPPED / split).is_dir() else [], own=[*folders, *trained])
+    rows = read_rows([SHIPPED / split] if (SHIPPED / split).is_dir() else [], local=[*folders, *trained])
     board = Board(rows, samples=args.samples or SAMPLES)
     pairs = board.neighbours()
     tables = [board_page.ranking(board, brief=True), board_page.targets(board)]

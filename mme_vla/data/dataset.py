@@ -274,14 +274,14 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         }
 
     def _frame_map(
-        self, source: int, episode: int, kept: np.ndarray, index: int, transforms: Sequence[HistoryTransform]
+        self, source: int, episode: int, frames: np.ndarray, index: int, transforms: Sequence[HistoryTransform]
     ) -> FrameMap | None:
-        """How transforms show an item's episode up to the last of the `kept` frames; None without transforms."""
+        """How transforms show an item's episode up to the last of its `frames`; None without transforms."""
         if not transforms:
             return None
         rng = np.random.default_rng([self.seed, self.epoch, index, TRANSFORMS])
         exec_start = int(self.sources[source].exec_starts[episode])
-        return map_frames(transforms, int(kept[-1]) + 1, exec_start, rng, keep=kept)
+        return map_frames(transforms, int(frames[-1]) + 1, exec_start, rng, keep=frames)
 
     def inputs_at(self, step: Step, rng: np.random.Generator, frames: FrameMap | None = None) -> dict[str, Any]:
         """What the network reads and learns of a step, with what its memory selects: its `history` and `past`.
@@ -310,8 +310,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                 item["past"] = past_views(spec, now, read, self.processor.images)
         return item
 
-    def _images(self, source: int, episode: int, shown: FrameMap | None, frames: np.ndarray) -> list[np.ndarray]:
-        frames = frames if shown is None else shown.real[frames]
+    def _images(self, source: int, episode: int, frame_map: FrameMap | None, frames: np.ndarray) -> list[np.ndarray]:
+        frames = frames if frame_map is None else frame_map.real[frames]
         return [self.sources[source].frames(episode, frames, name) for name in self._cameras]
 
     @property
@@ -399,12 +399,12 @@ class GroupDataset(TrainingDataset):
         return self._group(s, episode, frames, np.random.default_rng([self.seed, self.epoch, index]))
 
     def _group(
-        self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator, shown: FrameMap | None = None
+        self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator, frame_map: FrameMap | None = None
     ) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
         return {
-            "moments": [self.inputs_at(step, rng, shown) for step in steps],
-            "times": (frames if shown is None else shown.transformed(frames)).astype(np.int64),
+            "moments": [self.inputs_at(step, rng, frame_map) for step in steps],
+            "times": (frames if frame_map is None else frame_map.transformed(frames)).astype(np.int64),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,
             "place": (s, episode, int(frames[-1])),

@@ -60,7 +60,7 @@ def known_poses(noted: np.ndarray, exec_start: int, reached: Callable[[int], np.
 
     Args:
         noted: [t, 7], NaN where there was none yet. exec_start: the first execution step.
-        reached: the pose [7] that a step's action asks for, by its number.
+        reached: the pose [7] that a step's action commands, by its number.
 
     Returns:
         [t, 7] float32.

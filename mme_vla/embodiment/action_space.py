@@ -25,14 +25,14 @@ def columns(value: Any, where: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def column_indices(given: Any, where: str, width: int) -> tuple[int, ...]:
+def column_indices(value: Any, where: str, width: int) -> tuple[int, ...]:
     """Places of numbers in a vector of `width`, each once, counted from 0."""
-    numbers = [] if given is None else list(given) if isinstance(given, Sequence) else [given]
+    numbers = [] if value is None else list(value) if isinstance(value, Sequence) else [value]
     require(
         all(isinstance(i, int) and not isinstance(i, bool) and 0 <= i < width for i in numbers),
-        f"{where} must list numbers from 0 to {width - 1}, got {brief(given)}.",
+        f"{where} must list numbers from 0 to {width - 1}, got {brief(value)}.",
     )
-    require(len(set(numbers)) >= len(numbers), f"{where}={brief(given)} names a number twice.")
+    require(len(set(numbers)) >= len(numbers), f"{where}={brief(value)} names a number twice.")
     return tuple(sorted(numbers))
 
 

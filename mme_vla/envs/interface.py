@@ -94,7 +94,7 @@ class _Run:
     """Frames returned since the reset."""
     count: int = 0
     """Control steps that count towards the limit."""
-    held: int = 0
+    hold_steps: int = 0
     """Control steps for which the robot was told to hold its pose, by which the limit grows."""
     total_reward: float = 0.0
     options: dict[str, Any] = field(default_factory=dict)
@@ -348,8 +348,8 @@ class RoboMMEEnv(gymnasium.Env):
         run.truncated = torch.tensor(self._timed_out(run))
 
     def _hold(self, run: _Run, steps: int) -> None:
-        """Repeat the last command, while the scene goes on, until the episode ends."""
-        run.held += steps
+        """Repeat the last command, while the scene continues, until the episode ends."""
+        run.hold_steps += steps
         for left in reversed(range(steps)):
             run.control.demonstrator.left = left  # the last one's frame is the newest
             self._step_control(run.last_action)
@@ -408,7 +408,7 @@ class RoboMMEEnv(gymnasium.Env):
         return options
 
     def _timed_out(self, run: _Run) -> bool:
-        return run.count >= self.max_steps + run.held + _MARGIN
+        return run.count >= self.max_steps + run.hold_steps + _MARGIN
 
     def _require_run(self) -> _Run:
         if self._run is None:

@@ -161,9 +161,9 @@ def _checkpoint(policy: Policy, source: str | None) -> dict[str, Any]:
         # Those of the table were compared with the files when they were loaded.
         files = Sums(folder).table or _sums(folder, [path.name for path in folder.iterdir() if path.is_file()])
     statistics = digest(policy.require_processor().require_stats().to_dict(), 64)
-    kept = {name: value for name, value in sorted(files.items()) if not name.startswith(_OF_TRAINING)}
+    selected = {name: value for name, value in sorted(files.items()) if not name.startswith(_OF_TRAINING)}
     return {
-        "checkpoint": {"folder": str(source if folder is None else folder), "files": kept}, "statistics": statistics
+        "checkpoint": {"folder": str(source if folder is None else folder), "files": selected}, "statistics": statistics
     }  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, check_choice, require
+from mme_vla.errors import check_choice, require
 from mme_vla.memory.history import FrameScorer, History, LazyHistory, OnlineHistory, StorageSpec
 from mme_vla.types import HistoryTokens, Labels, MemoryTokens
 
@@ -20,8 +20,7 @@ POSITION_GRID = 16
 class PastViewSpec:
     """Past views that a memory gives the backbone along with the current ones, of every camera.
 
-    frames: how many, the current one among them. stride: frames between two of them.
-    every: see `PastViews`.
+    frames: how many, the current one included. stride: frames between two of them. every: see `PastViews`.
     """
 
     frames: int
@@ -300,15 +299,6 @@ def full_history(memory: MemoryModule, d_vision: int, device: torch.device | str
     )
 
 
-def check_grid(memory: MemoryModule, views: int) -> None:
-    """Raise an error unless views of views×views tokens can be pooled to the grid that the memory stores."""
-    if views % memory.storage.grid:
-        sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
-        raise UserError(
-            f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool to {sides} a side."
-        )
-
-
 def union_frames(lists: Sequence[np.ndarray]) -> np.ndarray:
     """All frames of some lists, ascending, each once; int64 [n]."""
     return np.unique(np.concatenate(lists)) if lists else np.zeros(0, np.int64)
@@ -379,9 +369,7 @@ class FeatureEncoder(nn.Module):
     """token = W₂ [feature | SiLU(W₁ position)]: nothing before, between or after, as released.
 
     Positions are `position_dim` wide: by default 3/8 of the vision width in multiples of 6, 768 at full size.
-
     Padding (zero feature, zero position) becomes the constant W₂ [0 | SiLU(b₁)]: only the mask tells it apart.
-
     With `positions="space"` the features of the frame, the first third, are zero. With `"none"` there is no W₁, and
     token = W₂ feature, which is the released encoder with `use_pos_emb: false`.
     """

@@ -16,7 +16,7 @@ def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
     return np.arange(step + 1) if step < count else np.linspace(0, step, count).astype(np.int64)
 
 
-def whole_frames(budget: int, grid: int, at_least: int = 1) -> int:
+def budget_frames(budget: int, grid: int, at_least: int = 1) -> int:
     """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole ones, and enough."""
     least = max(budget // grid**2, at_least) * grid**2
     require(
@@ -46,17 +46,17 @@ class FrameSamp(PerceptualMemory):
         Args:
             every: frames 0 and k·every − 1 can be remembered; the others are neither rendered nor encoded. 1: all.
         """
-        frames = whole_frames(budget, grid)
+        frames = budget_frames(budget, grid)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         self.frames = frames
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.chosen(int(step)) for step in steps])
+        return union_frames([self.selected_frames(int(step)) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return all_patches(self.chosen(step), self.storage.grid)
+        return all_patches(self.selected_frames(step), self.storage.grid)
 
-    def chosen(self, step: int) -> np.ndarray:
+    def selected_frames(self, step: int) -> np.ndarray:
         """The frames remembered at `step`: evenly spaced among those that are stored."""
         stored = self.storage.stored_frames(step + 1)
         return stored[evenly_spaced_frames(len(stored) - 1, self.frames)]

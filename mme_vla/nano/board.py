@@ -13,8 +13,8 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, holm, percentiles, resampled_means
-from mme_vla.evaluation.results.compare import Comparison, compare, compare_all
+from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, percentiles, resampled_means
+from mme_vla.evaluation.results.compare import Comparison, compare, compare_all, holm
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
 from mme_vla.nano.rows import Trained, Training
@@ -35,7 +35,7 @@ class Row:
     name: str
     facts: Trained
     method: Method
-    is_own: bool = False
+    is_local: bool = False
 
     @property
     def kind(self) -> str:
@@ -71,7 +71,7 @@ class Row:
 class Separation:
     """Whether memories differ on a task at a budget; success in percent.
 
-    memories: how many. lowest, mean, highest: of their success. spread: standard deviation between memories, less what
+    memories: how many. lowest, mean, highest: of their success. deviation: standard one between memories, less what
     trainings add. noise: between trainings of one memory, None with one training each. floor, ceiling: of the best
     floor and of the best ceiling. p: of `homogeneity`. corrected: by Holm over the tasks of the budget.
     """
@@ -82,7 +82,7 @@ class Separation:
     lowest: float
     mean: float
     highest: float
-    spread: float
+    deviation: float
     noise: float | None
     floor: float | None
     ceiling: float | None
@@ -175,10 +175,10 @@ class Board:
         """
         ranked = self.ranked
         pairs = list(pairwise(ranked))
-        if own := [row for row in ranked if row.is_own]:
-            pairs = [pair for pair in pairs if pair[0].is_own or pair[1].is_own]
+        if local := [row for row in ranked if row.is_local]:
+            pairs = [pair for pair in pairs if pair[0].is_local or pair[1].is_local]
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
-            pairs += [(other, row) for row in own for other in (ranked[0], *floors) if other is not row]
+            pairs += [(other, row) for row in local for other in (ranked[0], *floors) if other is not row]
         unique = {frozenset(row.name for row in pair): pair for pair in pairs}
         return compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)
 
@@ -263,7 +263,7 @@ def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
     methods = aggregate([record for training in trainings for record in training.records], protocol).methods
     require(len(methods) == 1, f"The row {name} holds {len(methods)} methods: {', '.join(m.label for m in methods)}.")
     methods[0].label = name
-    return Row(name, trainings[0].facts, methods[0], trainings[0].is_own)
+    return Row(name, trainings[0].facts, methods[0], trainings[0].is_local)
 
 
 def published_success(method: PaperMethod, tasks: Sequence[str]) -> float:

@@ -9,7 +9,7 @@ from mme_vla.evaluation.results.tables import Table, comparison_table, show, spa
 from mme_vla.nano.board import Board, Row, published_success
 
 PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
-OWN = COLOURS[1]
+LOCAL = COLOURS[1]
 
 
 def ranking(board: Board, brief: bool = False) -> Table:
@@ -30,7 +30,7 @@ def ranking(board: Board, brief: bool = False) -> Table:
         gflops = None if facts.update_flops is None else facts.update_flops / 1e9
         numbers = [(facts.parameters, ",.0f"), (gflops, ".2f"), (facts.update_s, ".3f"), (facts.cpu_minutes, ".1f")]
         costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
-        strong |= {len(rows)} if row.is_own else set()
+        strong |= {len(rows)} if row.is_local else set()
         rows.append([row.name, at, trainings, show(row.average), span(row.average), *cells, *costs])
     return Table(f"Ranking, split `{board.split}`", columns, rows, strong=strong)
 
@@ -45,11 +45,11 @@ def tasks(board: Board) -> Table:
 def separations(board: Board) -> Table:
     """Tasks and budgets at which memories differ, the clearest first."""
     rows = []
-    for s in sorted(board.separations(), key=lambda s: (s.corrected, s.p, -s.spread)):
+    for s in sorted(board.separations(), key=lambda s: (s.corrected, s.p, -s.deviation)):
         above, below = (None if end is None else abs(s.mean - end) for end in (s.floor, s.ceiling))
         rows.append([
             s.task, s.budget or "default", str(s.memories), f"{s.lowest:.0f} … {s.mean:.0f} … {s.highest:.0f}",
-            f"{s.spread:.1f}", _cell(s.noise, ".1f"), show_p(s.corrected), _cell(above, ".0f"), _cell(below, ".0f"),
+            f"{s.deviation:.1f}", _cell(s.noise, ".1f"), show_p(s.corrected), _cell(above, ".0f"), _cell(below, ".0f"),
         ])  # fmt: skip
     columns = ["task", "tokens", "memories", "lowest … mean … highest (%)", "spread", "noise", "p", "above the floor",
                "below the ceiling"]  # fmt: skip
@@ -62,11 +62,12 @@ def separating(board: Board) -> list[str]:
     sentences = []
     for budget in dict.fromkeys(s.budget for s in made):
         here = [s for s in made if s.budget == budget]
-        found = [s.task for s in here if s.corrected < 0.05]
+        separated = [s.task for s in here if s.corrected < 0.05]
         tokens = f"At {budget} tokens" if budget else "At the default budgets"
-        names = f": {', '.join(found)}" if found else ""
+        names = f": {', '.join(separated)}" if separated else ""
         sentences.append(
-            f"{tokens} {len(found)} of {len(here)} tasks separate the {here[0].memories} memories (p < 0.05){names}."
+            f"{tokens} {len(separated)} of {len(here)} tasks separate the {here[0].memories} memories "
+            f"(p < 0.05){names}."
         )
     return sentences
 
@@ -131,7 +132,7 @@ def standing(board: Board) -> list[str]:
     lines = []
     for row in board.ranked:
         place, (low, high) = board.places[row.name]
-        if row.is_own:
+        if row.is_local:
             lines.append(
                 f"{row.name}: place {place} of {len(board.ranked)}, between {low:.0f} and {high:.0f} with "
                 f"{100 * board.protocol.confidence:g} % confidence, with {show(row.average)} % {span(row.average)}."
@@ -145,7 +146,7 @@ def success_figure(board: Board) -> str:
     with figure((7.2, 0.26 * len(rows) + 1.0)) as (canvas, (axes,)):
         for at, row in enumerate(rows):
             low, high = row.average.interval or (0, 0)
-            mean, colour = board.success(row), OWN if row.is_own else PAINT[row.kind]
+            mean, colour = board.success(row), LOCAL if row.is_local else PAINT[row.kind]
             axes.plot([low, high], [at, at], color=colour, lw=1.6)
             axes.plot(mean, at, "o", color=colour, ms=6)
             axes.plot(row.mean(board.protocol.tasks), np.full(len(row.method.trainings), at), "|", color=INK, ms=7)

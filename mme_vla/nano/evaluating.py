@@ -182,8 +182,8 @@ def play_all(
         missing = [job for job in jobs if (job.spec.task, job.spec.episode) not in known]
         for record in carry_out(missing, play_episode, rules.workers):
             log.append(record)
-    chosen = {(spec.task, spec.episode) for spec in specs}
-    return [record for record in read_records(file) if record.key in chosen]
+    selected = {(spec.task, spec.episode) for spec in specs}
+    return [record for record in read_records(file) if record.key in selected]
 
 
 UNTRAINED = (

@@ -33,7 +33,7 @@ PLACE_WEIGHT = 2.0  # of the error of places, in cells, beside that of presences
 BATCH = 64  # images that are evaluated together
 VOTES = 1.0  # presences that make an object, which has four cells
 APART = 0.75  # cells: nearer reports of a class are one
-FOUND = 3.0  # centimetres between an object and its report at most
+MATCH_DISTANCE = 3.0  # centimetres between an object and its report at most
 
 
 @dataclass(frozen=True)
@@ -138,11 +138,11 @@ def augmented(images: Tensor, places: Tensor, batch: Tensor, rng: np.random.Gene
     right, down = (int(n) for n in rng.integers(-SHIFT, SHIFT + 1, 2))
     side = images.shape[-1]
     padded = functional.pad(images, (SHIFT,) * 4, mode="replicate")
-    moved = padded[..., SHIFT - down : SHIFT - down + side, SHIFT - right : SHIFT - right + side]
+    shifted = padded[..., SHIFT - down : SHIFT - down + side, SHIFT - right : SHIFT - right + side]
     places = places + torch.tensor([right, down]) / side
     mirrored = torch.from_numpy(rng.random(len(images)) < 0.5)
-    moved = torch.where(mirrored[:, None, None, None], moved.flip(-1), moved)
-    return moved, torch.where(mirrored[batch][:, None], torch.stack([1 - places[:, 0], places[:, 1]], 1), places)
+    shifted = torch.where(mirrored[:, None, None, None], shifted.flip(-1), shifted)
+    return shifted, torch.where(mirrored[batch][:, None], torch.stack([1 - places[:, 0], places[:, 1]], 1), places)
 
 
 def tower_loss(logits: Tensor, offsets: Tensor, presence: Tensor, places: Tensor, weights: Tensor) -> Tensor:
@@ -231,7 +231,7 @@ class ClassResult:
     """One class on held-out scenes.
 
     places: visible objects. reports: of the class. errors: centimetres between each object and its report, of those
-    that are found: an object and a report belong together once, the nearest first, up to `FOUND`.
+    that are found: an object and a report belong together once, the nearest first, up to `MATCH_DISTANCE`.
     """
 
     places: int
@@ -289,18 +289,18 @@ def evaluate_tower(tower: PlaceTower, scenes: Scenes) -> dict[str, ClassResult]:
     for number, name in enumerate(CLASSES):
         errors: list[float] = []
         rows = (scenes.classes == number).nonzero()[:, 0]
-        for image, places in enumerate(found[number] for found in reports):
+        for image, places in enumerate(detected[number] for detected in reports):
             centres = scenes.centres[rows[scenes.owners[rows] == image].numpy()]
             distances = [[np.linalg.norm(on_plane(place, z) - (x, y)) for place in places] for x, y, z in centres]
             errors += match(100 * np.array(distances).reshape(len(centres), len(places)))
-        results[name] = ClassResult(len(rows), sum(len(found[number]) for found in reports), np.array(errors))
+        results[name] = ClassResult(len(rows), sum(len(detected[number]) for detected in reports), np.array(errors))
     return results
 
 
 def match(distances: np.ndarray) -> list[float]:
-    """The distances, up to `FOUND`, of pairs of a row and a column, the nearest pair first, each in one pair."""
+    """The distances, up to `MATCH_DISTANCE`, of pairs of a row and a column, the nearest first, each in one pair."""
     errors: list[float] = []
-    while distances.size and distances.min() <= FOUND:
+    while distances.size and distances.min() <= MATCH_DISTANCE:
         row, column = np.unravel_index(distances.argmin(), distances.shape)
         errors.append(float(distances[row, column]))
         distances = np.delete(np.delete(distances, row, 0), column, 1)
@@ -312,8 +312,8 @@ def report(results: dict[str, ClassResult]) -> str:
     lines = ["| class | places | found | median error | wrong reports |", "|---|---:|---:|---:|---:|"]
     for name, result in results.items():
         if result.places:
-            found, wrong = len(result.errors), result.reports - len(result.errors)
-            median = f"{np.median(result.errors):.1f} cm" if found else ""
-            shares = 100 * found / result.places, 100 * wrong / max(result.reports, 1)
+            detected, wrong = len(result.errors), result.reports - len(result.errors)
+            median = f"{np.median(result.errors):.1f} cm" if detected else ""
+            shares = 100 * detected / result.places, 100 * wrong / max(result.reports, 1)
             lines.append(f"| {name} | {result.places} | {shares[0]:.0f} % | {median} | {shares[1]:.0f} % |")
     return "\n".join(lines)

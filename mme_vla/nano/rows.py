@@ -68,7 +68,7 @@ class Training:
     facts: Trained
     records: Sequence[EpisodeRecord]
     rules: str
-    is_own: bool = False
+    is_local: bool = False
 
     @property
     def scenes(self) -> dict[EpisodeKey, tuple[str, int, str, int]]:
@@ -76,10 +76,10 @@ class Training:
         return {r.key: (r.split, r.seed, r.difficulty, r.max_steps) for r in self.records}
 
 
-def read_rows(folders: Iterable[Path], own: Iterable[Path] = ()) -> dict[str, list[Training]]:
+def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, list[Training]]:
     """The trainings of each row in or below folders, by the row's name, in the order of their seeds.
 
-    own: folders of the user, whose rows are called `<name> (yours)` where the others have the name.
+    local: folders of the user, whose rows are called `<name> (yours)` where the others have the name.
 
     Raises:
         UserError: a folder that does not keep the schema, two trainings with the same weights or different recipes in
@@ -87,11 +87,11 @@ def read_rows(folders: Iterable[Path], own: Iterable[Path] = ()) -> dict[str, li
     """
     trainings = [read_training(place) for place in _places(folders)]
     names = {training.facts.row for training in trainings}
-    trainings += [replace(read_training(place), is_own=True) for place in _places(own)]
+    trainings += [replace(read_training(place), is_local=True) for place in _places(local)]
     rows: dict[str, list[Training]] = {}
     for training in sorted(trainings, key=lambda training: training.facts.seed):
         name = training.facts.row
-        row = rows.setdefault(f"{name} (yours)" if training.is_own and name in names else name, [])
+        row = rows.setdefault(f"{name} (yours)" if training.is_local and name in names else name, [])
         if row:
             _check_alike(row[0], training)
         row.append(training)

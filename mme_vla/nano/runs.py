@@ -71,7 +71,7 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
             logger.info("%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row))
         return results
     with minutes.of("films"):
-        videos = films(config, jobs, records, folder / "films")
+        videos = videos_of(config, jobs, records, folder / "films")
     page = write_page(folder, config, records, rows.blind, minutes.spent, videos,
                       {row: [job.folder for job in of_row] for row, of_row in jobs.items()})  # fmt: skip
     print(page)
@@ -163,11 +163,11 @@ def evaluate_all(
     rules, specs = rules_of(config), episodes_of(config, folder)
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
-        chosen = episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
+        selected = episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
         records[row] = []
         for job in of_row:
             place = folder / row / str(job.config["seed"])
-            records[row] += evaluate_row(job.folder, job.checkpoint, place, chosen, rules)
+            records[row] += evaluate_row(job.folder, job.checkpoint, place, selected, rules)
     if config["shard"] is None:
         by_choice = bool(robot.action.choice)
         moves = frequent_moves(files, robot.action) if by_choice else {}
@@ -189,16 +189,16 @@ def episodes_of(config: Mapping[str, Any], folder: Path, episodes: Any = None) -
     """The episodes of the run; with `replace` scenes that cannot be built are replaced by later ones."""
     from mme_vla.nano.evaluating import built_scenes
 
-    chosen = config["episodes"] if episodes is None else episodes
+    selected = config["episodes"] if episodes is None else episodes
     if not config["replace"]:
-        return choose_episodes(config["task"], chosen, config["split"])
-    specs, left_out = built_scenes(folder / "scenes.json", config["task"], config["split"], chosen, config["workers"])
+        return choose_episodes(config["task"], selected, config["split"])
+    specs, left_out = built_scenes(folder / "scenes.json", config["task"], config["split"], selected, config["workers"])
     for line in left_out:
         logger.info("left out: %s", line)
     return specs
 
 
-def films(
+def videos_of(
     config: Mapping[str, Any],
     jobs: Mapping[str, Sequence["Training"]],
     records: Mapping[str, Sequence[Any]],
@@ -221,14 +221,14 @@ def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
     """How many demonstrations of each task and difficulty."""
     counts: dict[tuple[str, str], int] = {}
     for task in choose_tasks(config["task"]):
-        wanted = {**config["demonstrations"], **config["demonstrations_of"].get(task, {})}
-        fits = set(wanted) <= set(LEVELS) and all(isinstance(n, int) and n >= 0 for n in wanted.values())
+        amounts = {**config["demonstrations"], **config["demonstrations_of"].get(task, {})}
+        fits = set(amounts) <= set(LEVELS) and all(isinstance(n, int) and n >= 0 for n in amounts.values())
         require(
             fits,
-            f"demonstrations={brief(wanted)}: write how many of each difficulty ({', '.join(LEVELS)}), such as "
+            f"demonstrations={brief(amounts)}: write how many of each difficulty ({', '.join(LEVELS)}), such as "
             "{easy: 100}.",
         )
-        counts |= {(task, level): n for level, n in wanted.items()}
+        counts |= {(task, level): n for level, n in amounts.items()}
     require(
         sum(counts.values()) >= 2,
         f"demonstrations={brief(config['demonstrations'])}: it takes two, to learn from and to measure by.",
@@ -298,9 +298,9 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
         while lacking := [group for group in groups if len(group.files) < group.required]:
             tried = [group.next() for group in lacking]
             # In turn, so that an interrupted run has some of every group.
-            turns = [scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None]
-            missing = [scene for scene in turns if not scene.tried]
-            advance(sum(scene.path.is_file() for scene in turns if scene.tried))
+            alternating = [scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None]
+            missing = [scene for scene in alternating if not scene.tried]
+            advance(sum(scene.path.is_file() for scene in alternating if scene.tried))
             for made in carry_out(missing, demonstrated, workers):
                 advance(int(made))
             for group, scenes in zip(lacking, tried, strict=True):

@@ -60,7 +60,7 @@ def _named_places(env: "Task") -> Iterator[tuple[str, np.ndarray, list[int]]]:
             yield name, where, ids
             if isinstance(thing, Button) and pressed(thing):
                 yield "pressed button", where, ids
-            if _held(env, name, where):
+            if _in_gripper(env, name, where):
                 yield f"held {name}" if f"held {name}" in CLASSES else "other held object", where, ids
     for name, disc in lit:
         yield name, disc.position, disc.segmentation_ids
@@ -107,7 +107,7 @@ def _lit_discs(env: "Task") -> Iterator[tuple[str, Any]]:
                 yield kind, disc
 
 
-def _held(env: "Task", name: str, centre: np.ndarray) -> bool:
+def _in_gripper(env: "Task", name: str, centre: np.ndarray) -> bool:
     finger = float(env.fingers.mean())
     near = float(np.linalg.norm(centre - env.tcp_pose.p)) < IN_HAND
     return name.endswith(("cube", "container", "peg end")) and near and GRASP[0] < finger < GRASP[1]
@@ -189,7 +189,7 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
     import torch
 
     for thing in env.things:
-        _put_elsewhere(thing, rng)
+        _relocate(thing, rng)
     _light(env, rng)
     near = [thing for thing in env.things if np.abs(thing.position).max() < 0.5]
     place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), rng.uniform(0.03, 0.35)])
@@ -207,7 +207,7 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
         over.move_to(_pose(env.tcp_pose.p, over.pose.q))
 
 
-def _put_elsewhere(thing: Any, rng: np.random.Generator) -> None:
+def _relocate(thing: Any, rng: np.random.Generator) -> None:
     """Turned and, three times of ten, where it was; now and then lifted; containers out of the way half of the time."""
     name, home = _class_of(thing), thing.initial_pose
     if name == "container" and rng.random() < 0.5:
@@ -225,13 +225,13 @@ def _light(env: "Task", rng: np.random.Generator) -> None:
     from mme_vla.envs.scene.objects import BELOW_TABLE
     from mme_vla.envs.scene.things import Thing
 
-    hosts: dict[str, list[Thing]] = {"highlight": [], "mark": []}
+    bases: dict[str, list[Thing]] = {"highlight": [], "mark": []}
     for thing in env.things:
         name = _class_of(thing)
         if "cube" in name or name in ("target", "disc"):
-            hosts["highlight" if "cube" in name else "mark"].append(thing)
+            bases["highlight" if "cube" in name else "mark"].append(thing)
     for name, actor in env.scene.actors.items():
-        among = hosts.get(name.partition("_")[0])
+        among = bases.get(name.partition("_")[0])
         if among:
             disc, lit = Thing(name, actor), rng.random() > 0.6
             below = among[rng.integers(len(among))].position - [0, 0, Highlight.DEPTH] if lit else BELOW_TABLE

@@ -89,9 +89,9 @@ def tokenize(policy: MMEPolicy, demonstration: Demonstration, memories: Iterable
             views = processor.images([np.stack([taken[int(k)] for k in some])] * len(policy.embodiment.camera_names))
             parts.append(policy.backbone.encode_images(views[:, 0].float() / 255 * 2 - 1).half())
         tokens[camera] = torch.cat(parts)
-    own = [] if policy.memory is None else [policy.memory]
+    readers = [*memories] if policy.memory is None else [policy.memory, *memories]
     images = demonstration.images.get(policy.embodiment.memory_camera, {})
-    scores = {memory.storage.scorer: _scores(memory, images) for memory in (*own, *memories) if memory.storage.scorer}
+    scores = {memory.storage.scorer: _scores(memory, images) for memory in readers if memory.storage.scorer}
     return FrameTokens(frames, tokens, scores)
 
 
@@ -100,8 +100,8 @@ def _scores(memory: "Memory", images: Mapping[int, np.ndarray]) -> FrameScores:
     scorer = make_scorer(memory)
     assert scorer is not None
     read = frames_scored(memory, max(images) + 1).tolist()
-    given = {frame: scorer(frame, images[frame]) for frame in read if frame in images}
-    rows = {frame: values for frame, values in given.items() if values is not None}
+    scored_rows = {frame: scorer(frame, images[frame]) for frame in read if frame in images}
+    rows = {frame: values for frame, values in scored_rows.items() if values is not None}
     if not rows:
         return FrameScores.empty(memory.storage.grid**2)
     return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
@@ -163,8 +163,8 @@ class TokenStore:
             return False
         with safe_open(path, "pt") as tensors:
             scored = {name.removeprefix("scores/") for name in tensors.keys() if name.startswith("scores/")}  # noqa: SIM118
-            wanted = {_memory(text).storage.scorer for text in self.memories}
-            return bool(tensors.metadata().get("stamp") == stamp) and wanted <= scored
+            required = {_memory(text).storage.scorer for text in self.memories}
+            return bool(tensors.metadata().get("stamp") == stamp) and required <= scored
 
 
 @cache

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ChosenActions:
+class SelectedActions:
     """What a policy chose for n episodes.
 
     batch: of `Policy.observation`. chunk: [n, h, a], in the network's units. actions: float32 [n, h, w], as the
@@ -33,7 +33,7 @@ def choose_actions(
     policy: "Policy",
     episodes: Sequence["Episode"],
     predict: Callable[[Any, Mapping[str, Tensor]], Tensor],
-) -> ChosenActions:
+) -> SelectedActions:
     """Choose the next chunk for episodes in one batch, with each episode's own noise.
 
     Args:
@@ -55,4 +55,4 @@ def choose_actions(
     actions = torch.stack(decided).numpy()[:, processor.samples.window - 1 :]
     for episode, actions_of, notes in zip(episodes, actions, stored, strict=True):
         episode.acted(actions_of, notes)
-    return ChosenActions(batch, chunk, actions)
+    return SelectedActions(batch, chunk, actions)

@@ -14,7 +14,7 @@ from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import CacheMemory, Memory, check_grid, past_view_spec
+from mme_vla.memory.base import CacheMemory, Memory, MemoryModule, past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
@@ -32,6 +32,15 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
     memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
     check_grid(memory, grid)
     return memory
+
+
+def check_grid(memory: MemoryModule, views: int) -> None:
+    """Raise an error unless views of views×views tokens can be pooled to the grid that the memory stores."""
+    if views % memory.storage.grid:
+        sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
+        raise UserError(
+            f"memory.grid={memory.storage.grid}: the backbone's {views}×{views} tokens a view pool to {sides} a side."
+        )
 
 
 def check_integrated(

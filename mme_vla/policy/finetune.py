@@ -152,8 +152,8 @@ def add_adapters(
     seed: int = 42,
 ) -> None:
     """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
-    adapted = policy.config.get("adapters") and any(".lora_" in name for name, _ in policy.named_parameters())
-    require(not adapted, "This policy has adapters already: merge_adapters() first.")
+    has_adapters = policy.config.get("adapters") and any(".lora_" in name for name, _ in policy.named_parameters())
+    require(not has_adapters, "This policy has adapters already: merge_adapters() first.")
     require(
         rank >= 1 and alpha > 0 and 0 <= dropout < 1,
         f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0, dropout in [0, 1).",

@@ -61,7 +61,7 @@ class Arm:
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         """The subgoal that the policy reads instead."""
-        return reduce(lambda said, part: part.say(said, moment), self.parts, subgoal)
+        return reduce(lambda subgoal_text, part: part.say(subgoal_text, moment), self.parts, subgoal)
 
     def dial(self) -> float | None:
         """Where the arm stands on its dial, if it is one intervention with a number for one."""

@@ -189,7 +189,7 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
 
 
 def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -> ClockScore:
-    """The memory-or-clock score. sampled: the losses of each arm on the same scenes drawn anew, [samples]."""
+    """The memory-or-clock score. sampled: the losses of each arm on the same resampled scenes, [samples]."""
     if missing := [label for label in (TIME, CONTENT) if label not in losses]:
         return ClockScore(undefined=f"{' and '.join(missing)} could not be measured")
     if not any(losses[label].beyond_noise for label in (TIME, CONTENT)):
@@ -252,7 +252,7 @@ def _mean(values: Outcomes) -> float:
 
 
 def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
-    """Means over tasks of scenes drawn anew within each task, the same ones for all columns: [columns, samples]."""
+    """Means over tasks of scenes resampled within each task, the same ones for all columns: [columns, samples]."""
     rng, keys = np.random.default_rng(0), list(columns[0]) if columns else []
     tasks = dict.fromkeys(key.task for key in keys)
     means = np.zeros((len(columns), _SAMPLES))

@@ -93,10 +93,10 @@ class OnlyFrames(History):
         """Take the stored frames `frames` [m], ascending, at least one; the last means the current one."""
         every = full.spec.keep_every
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
-        self._kept = full.spec.stored_frames(self._length)
-        self.frames = dict(zip(self._kept.tolist(), frames.tolist(), strict=True))
+        self._stored = full.spec.stored_frames(self._length)
+        self.frames = dict(zip(self._stored.tolist(), frames.tolist(), strict=True))
         earlier = int((frames < full.exec_start).sum())
-        super().__init__(full.spec, int(self._kept[earlier]) if earlier < len(frames) else self._length)
+        super().__init__(full.spec, int(self._stored[earlier]) if earlier < len(frames) else self._length)
         self._full_history = full
 
     def __len__(self) -> int:

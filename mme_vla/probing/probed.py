@@ -41,7 +41,7 @@ class DonorEpisode:
 
     def __init__(self, policy: Policy, channel: Channel, recording: Recording) -> None:
         self._channel, self.recording = channel, recording
-        self._said = subgoal_kind(policy) or SUBGOAL
+        self._subgoal_kind = subgoal_kind(policy) or SUBGOAL
         self._episode: Episode | None = None
         self._policy = policy
 
@@ -50,22 +50,22 @@ class DonorEpisode:
 
         def store(name: str) -> Remembered:
             step = self._step(episode) if self._channel.chooses else None
-            stores = {store.name: store for store in self._channel.read(self._seen(), step).stores}
+            stores = {store.name: store for store in self._channel.read(self._observed(), step).stores}
             return stores[name]
 
         return store
 
     def subgoal_of(self, episode: ProbedEpisode) -> str | None:
         """The subgoal there, as many execution frames in."""
-        if self._said not in self.recording.source.subgoal_names:
+        if self._subgoal_kind not in self.recording.source.subgoal_names:
             return None
-        return self.recording.subgoal(self._step(episode), self._said)
+        return self.recording.subgoal(self._step(episode), self._subgoal_kind)
 
     def _step(self, episode: ProbedEpisode) -> int:
         executed = episode.n_observed_frames - 1 - (episode.exec_start or 0)
         return min(self.recording.exec_start + max(executed, 0), self.recording.length - 1)
 
-    def _seen(self) -> Episode:
+    def _observed(self) -> Episode:
         if self._episode is None:
             recording, policy = self.recording, self._policy
             running, observed = policy.start_episode(recording.goal), 0
@@ -74,7 +74,7 @@ class DonorEpisode:
             for stop in stops:
                 recording.show(running, observed, stop + 1)
                 observed = stop + 1
-                running.subgoal = recording.subgoal(stop, self._said)
+                running.subgoal = recording.subgoal(stop, self._subgoal_kind)
                 policy.act([running])
             recording.show(running, observed, recording.length, stored_frames(policy, recording.length))
             self._episode = running

@@ -71,35 +71,35 @@ def harmonic_mean(a: float, b: float) -> float:
 
 
 def score_episode(
-    kept: Selection, facts: Mapping[str, np.ndarray], length: int, exec_start: int, stride: int = STRIDE
+    selection: Selection, facts: Mapping[str, np.ndarray], length: int, exec_start: int, stride: int = STRIDE
 ) -> EpisodeWriting | None:
     """Score a selection along one episode; None where no fact has been visible at any step of the execution.
 
     Args:
-        kept: the frames kept at a step. facts: name → frames that show it, ascending.
+        selection: the frames selected at a step. facts: name → frames that show it, ascending.
         length: of the episode. exec_start: its first execution frame. stride: frames between two steps.
     """
     visible = np.zeros((len(facts), length), bool)
     for row, frames in zip(visible, facts.values(), strict=True):
         row[frames] = True
     first = visible.argmax(1) if len(facts) else np.zeros(0, np.int64)
-    held = np.full(len(facts), -1)
+    retained = np.full(len(facts), -1)
     rows = []
     for step in range(0, length, stride):
         begun = first <= step
         if not begun.any():
             continue
-        frames, past = kept(step), visible[:, : step + 1]
-        shown = past[:, frames]
-        held[(held < 0) & shown.any(1)] = step
+        frames, past = selection(step), visible[:, : step + 1]
+        selected = past[:, frames]
+        retained[(retained < 0) & selected.any(1)] = step
         if step >= exec_start:
             count = len(frames)
-            shows = float(shown.any(0).mean()) if count else 0.0
+            shows = float(selected.any(0).mean()) if count else 0.0
             missed = [comb(step + 1 - int(row.sum()), count) / comb(step + 1, count) for row in past[begun]]
-            rows.append((shows, shown[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed)))
+            rows.append((shows, selected[begun].any(1).mean(), past.any(0).mean(), 1 - np.mean(missed)))
     if not rows:
         return None
-    lags = (held - first)[held >= 0].tolist()
+    lags = (retained - first)[retained >= 0].tolist()
     precision, recall, chance_precision, chance_recall = np.mean(np.asarray(rows), axis=0).tolist()
     return EpisodeWriting(precision, recall, chance_precision, chance_recall, lags, len(facts))
 
@@ -144,11 +144,11 @@ def oracle_selection(episode: EvidenceEpisode) -> Selection:
 def random_selection(episode: EvidenceEpisode) -> Selection:
     """`FRAMES` frames at random, anew at each step: chance."""
 
-    def kept(step: int) -> np.ndarray:
+    def selection(step: int) -> np.ndarray:
         rng = np.random.default_rng([episode.episode, step])
         return np.sort(rng.choice(step + 1, min(FRAMES, step + 1), replace=False))
 
-    return kept
+    return selection
 
 
 def boundary_selection(episode: EvidenceEpisode) -> Selection:
@@ -169,7 +169,7 @@ class TokenlessHistory(CachedHistory):
         )
 
 
-def kept_frames(memory: MemoryModule, history: History, step: int) -> np.ndarray:
+def selected_frames(memory: MemoryModule, history: History, step: int) -> np.ndarray:
     """The frames that a memory keeps at a step, ascending: those of its selection.
 
     Where `forward` chooses among the selected tokens, those of its memory tokens.
@@ -194,7 +194,7 @@ def reads_tokens(memory: MemoryModule) -> bool:
     history = TokenlessHistory(memory.storage, np.zeros(0), stored, LONGEST)
     history.motion, history.state_width = torch.zeros(LONGEST, 8).__getitem__, 8
     try:
-        kept_frames(memory, history, LONGEST - 1)
+        selected_frames(memory, history, LONGEST - 1)
     except TokensReadError:
         return True
     return False
@@ -228,7 +228,7 @@ def memory_selection(
         tokens = policy.encode_frames(np.stack([episode.images[t] for t in stored.tolist()])).float()
         history = CachedHistory(context[0], tokens.cpu().numpy(), *context[1:])
     history.motion, history.state_width = states.__getitem__, states.shape[1]
-    return lambda step: kept_frames(memory, history, step)
+    return lambda step: selected_frames(memory, history, step)
 
 
 @torch.no_grad()
@@ -260,10 +260,10 @@ def score_writing(
     tower = policy if isinstance(selector, MemoryModule) and reads_tokens(selector) else None
     for episode, motion in zip(episodes, states, strict=True):
         if isinstance(selector, str):
-            kept = REFERENCES[selector](episode)
+            selection = REFERENCES[selector](episode)
         else:
-            kept = memory_selection(selector, episode, motion, tower)
-        score = score_episode(kept, episode.facts, episode.length, episode.exec_start, stride)
+            selection = memory_selection(selector, episode, motion, tower)
+        score = score_episode(selection, episode.facts, episode.length, episode.exec_start, stride)
         if score is not None:
             writing.tasks.setdefault(episode.task, []).append(score)
     return writing

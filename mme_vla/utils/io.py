@@ -214,7 +214,7 @@ def is_text(value: object) -> bool:
 
 
 def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = dict, finite: bool = True) -> Any:
-    """Parse JSON that somebody else wrote.
+    """Parse JSON of another program.
 
     Args:
         text: the JSON.

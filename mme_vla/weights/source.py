@@ -276,12 +276,12 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         lerobot = any(name.startswith(LEROBOT_PREFIX) for name in names)
         described = Source("lerobot", folder).config.get("type") is not None
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
-    is_ours = "backbone" in Source("ours", folder).config
+    is_native = "backbone" in Source("ours", folder).config
     has_qwen = any(name.endswith("model.visual.pos_embed.weight") for name in names)
-    if not is_ours and has_qwen and METHOD_FORMATS["simplememvla"].function("matches")(names):
+    if not is_native and has_qwen and METHOD_FORMATS["simplememvla"].function("matches")(names):
         return Source("simplememvla", folder, files)
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
-    if any(name.startswith("backbone.") for name in names) or is_ours:
+    if any(name.startswith("backbone.") for name in names) or is_native:
         return Source("ours", folder, files)
     if METHOD_FORMATS["openvla"].function("matches")(names):
         return Source("openvla", folder, files)

@@ -69,21 +69,21 @@ class Stay(Task):
     def goals(self):
         return ["stay where you are"]
 '''
-OWN = "own_parts"
+USER_PACKAGE = "own_parts"
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a package of one's own, and a checkpoint of its memory after one update, in `checkpoint`."""
     folder = tmp_path_factory.mktemp("place")
-    (folder / OWN).mkdir()
-    (folder / OWN / "__init__.py").write_text("")
-    (folder / OWN / "memory.py").write_text(MEMORY.format(name="fading"))
-    (folder / OWN / "task.py").write_text(TASK.format(name="Stay"))
+    (folder / USER_PACKAGE).mkdir()
+    (folder / USER_PACKAGE / "__init__.py").write_text("")
+    (folder / USER_PACKAGE / "memory.py").write_text(MEMORY.format(name="fading"))
+    (folder / USER_PACKAGE / "task.py").write_text(TASK.format(name="Stay"))
     (folder / "configs" / "model").mkdir(parents=True)
     (folder / "configs" / "model" / "fading.yaml").write_text(
         "# @package _global_\ndefaults: [{/integration: context}]\nname: fading\nmemory: {name: fading}\n"
-        f"plugins: [{OWN}.memory]\n"
+        f"plugins: [{USER_PACKAGE}.memory]\n"
     )
     before = list(sys.path)
     sys.path.insert(0, str(folder))
@@ -92,7 +92,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         policy = build_policy("fading", config_dir=folder / "configs", backbone=small)
     finally:
         sys.path[:] = before
-        plugins._imported.pop(f"{OWN}.memory", None)  # not asked of other tests' worker processes
+        plugins._imported.pop(f"{USER_PACKAGE}.memory", None)  # not asked of other tests' worker processes
     policy.require_processor().stats = unit_stats()
     policy(random_batch(policy, 1, valid=32))[0].backward()
     torch.optim.SGD(policy.parameters(), 1e-3).step()
@@ -103,7 +103,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def foreign_run(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder, in a process that has not imported what lies there."""
-    for name in [name for name in sys.modules if name.split(".")[0] == OWN]:
+    for name in [name for name in sys.modules if name.split(".")[0] == USER_PACKAGE]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry != str(place)])
     monkeypatch.chdir(place)
@@ -132,9 +132,9 @@ def opened_by_analyse(folder: Path, trust: bool) -> None:
 def test_a_checkpoints_plugins_are_imported_only_when_the_user_says_so(
     opened: Callable[[Path, bool], None], foreign_run: Path
 ) -> None:
-    with pytest.raises(UserError, match=rf"plugin {OWN}\.memory.*{TRUST_FLAG}.*trust_plugins=True"):
+    with pytest.raises(UserError, match=rf"plugin {USER_PACKAGE}\.memory.*{TRUST_FLAG}.*trust_plugins=True"):
         opened(foreign_run / "checkpoint", False)
-    assert f"{OWN}.memory" not in sys.modules
+    assert f"{USER_PACKAGE}.memory" not in sys.modules
     opened(foreign_run / "checkpoint", True)
 
 
@@ -160,7 +160,7 @@ def test_plugins_are_names_of_modules(names: str) -> None:
 @pytest.mark.skipif(find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed")
 def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(foreign_run: Path, tmp_path: Path) -> None:
     policy = MMEPolicy.from_pretrained(foreign_run / "checkpoint", trust_plugins=True)
-    import_modules([f"{OWN}.task"])
+    import_modules([f"{USER_PACKAGE}.task"])
     settings = RolloutSettings(max_steps=3, execute=2, flow_steps=1, workers=1, render=False)
     facts = RunFacts("fading", 1, 42, max_steps=3)
     records = evaluate(policy, choose_episodes("Stay", 1), tmp_path, facts, settings, show_progress=False).records
@@ -170,7 +170,7 @@ def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(forei
 def test_episodes_of_a_custom_task_have_separate_seeds(foreign_run: Path) -> None:
     if find_spec("mani_skill") is None:
         pytest.skip("the simulator (extra `sim`) is not installed")
-    import_modules([f"{OWN}.task"])
+    import_modules([f"{USER_PACKAGE}.task"])
     seeds = {spec.seed for split in ("val", "test") for spec in metadata.episodes("Stay", split)}
     benchmark = {spec.seed for split in ("val", "test") for spec in metadata.episodes("PickXtimes", split)}
     assert len(seeds) == 100

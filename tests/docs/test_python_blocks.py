@@ -16,7 +16,7 @@ from mme_vla.testing.small import unit_stats
 
 pytestmark = pytest.mark.slow
 
-ELSEWHERE = {
+TESTED_BY = {
     "README.md": "tests/integration/test_model_alone.py",
     "docs/start/python.md": "tests/end_to_end/test_python_page.py",
     "docs/extend/add-a-memory.md": "tests/memory/test_own_memory.py",
@@ -162,7 +162,7 @@ def server(request: pytest.FixtureRequest) -> Iterator[str]:
         process.communicate()
 
 
-@pytest.mark.parametrize("page", [page for page in pages() if page not in ELSEWHERE.keys() | NOT_RUN.keys()])
+@pytest.mark.parametrize("page", [page for page in pages() if page not in TESTED_BY.keys() | NOT_RUN.keys()])
 def test_the_blocks_of_a_page_run(page: str, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["page"])
@@ -176,8 +176,8 @@ def test_the_blocks_of_a_page_run(page: str, server: str, tmp_path: Path, monkey
 
 
 def test_each_exception_is_a_page_with_blocks_and_a_test() -> None:
-    assert ELSEWHERE.keys() | NOT_RUN.keys() | INSTEAD.keys() | PREPARE.keys() <= set(pages())
-    assert all((REPOSITORY / test).is_file() for test in ELSEWHERE.values())
+    assert TESTED_BY.keys() | NOT_RUN.keys() | INSTEAD.keys() | PREPARE.keys() <= set(pages())
+    assert all((REPOSITORY / test).is_file() for test in TESTED_BY.values())
     for page, replacements in INSTEAD.items():
         assert all(any(text in block for block in blocks(page)) for text, _ in replacements), page
 

@@ -11,7 +11,7 @@ from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError
 
-STEPS, LOOK = {"VideoUnmaskSwap": 220, "ButtonUnmaskSwap": 220}, 4
+STEPS, EVERY = {"VideoUnmaskSwap": 220, "ButtonUnmaskSwap": 220}, 4
 """Of others 80: enough for objects to be covered (64). A state that differs once differs until the end."""
 
 
@@ -24,7 +24,7 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
         action = np.array(env.reset_action, np.float32)
         action[:7] += 0.05 * np.sin(0.1 * k)
         env.step(action)
-        if k % LOOK == LOOK - 1:
+        if k % EVERY == EVERY - 1:
             observed.append(env.get_state().cpu().numpy())
     texts = [*env.goals(), *(subtask.text for subtask in env.progress.subtasks)]
     env.close()
@@ -35,7 +35,7 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
 def test_the_same_seed_gives_bit_equal_states_twice(task: str) -> None:
     (first, words), (second, same_words) = states(task, "hard"), states(task, "hard")
     assert np.array_equal(first, second) and words == same_words
-    assert len(first) == STEPS.get(task, 80) // LOOK + 1 and not np.array_equal(first[0], first[-1]), "nothing moved"
+    assert len(first) == STEPS.get(task, 80) // EVERY + 1 and not np.array_equal(first[0], first[-1]), "nothing moved"
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ def joints(env: RoboMMEEnv, k: int) -> np.ndarray:
     return action
 
 
-def go_on(env: RoboMMEEnv, actions: list[Any]) -> list[Any]:
+def resume(env: RoboMMEEnv, actions: list[Any]) -> list[Any]:
     """Everything that an environment says and is, after each of these actions."""
     observations = []
     for action in actions:
@@ -59,20 +59,20 @@ def test_a_restored_episode_goes_on_to_the_last_bit(
     assert isinstance(env, RoboMMEEnv)
     first, last = [[joints(env, k) if a is None else a for k, a in enumerate(some)] for some in (before, after)]
     env.reset()
-    reached = go_on(env, first)[-1]
+    reached = resume(env, first)[-1]
     state = env.save_state()
-    expected = go_on(env, last)
+    expected = resume(env, last)
     frames: list[Any] = []
     env.on_frame = lambda *frame: frames.append(frame)
     observation, info = env.restore_state(state)
     assert same(observation, reached[0]) and same(info, reached[4]) and frames == []
     assert np.array_equal(env.task.get_state().cpu().numpy(), reached[5])
-    assert same(go_on(env, last), expected) and frames
+    assert same(resume(env, last), expected) and frames
     env.close()
     fresh = make_env(task, split, 3, space, render=False, reward="subtask")
     assert isinstance(fresh, RoboMMEEnv)
     fresh.restore_state(pickle.loads(pickle.dumps(state)))
-    assert same(go_on(fresh, last), expected), "another environment, in another process for all it knows"
+    assert same(resume(fresh, last), expected), "another environment, in another process for all it knows"
     fresh.close()
 
 
@@ -81,12 +81,12 @@ def test_the_newest_frame_is_rendered_and_the_request_stays_what_it_was() -> Non
     env = make_env("PickXtimes", "test", 0)
     assert isinstance(env, RoboMMEEnv)
     env.reset()
-    reached = go_on(env, [joints(env, k) for k in range(3)])[-1]
+    reached = resume(env, [joints(env, k) for k in range(3)])[-1]
     state = env.save_state()
-    after = go_on(env, [joints(env, 3)])
+    after = resume(env, [joints(env, 3)])
     observation, info = env.restore_state(state)
     assert same(observation, reached[0]) and same(info, reached[4]) and env.render_request is None
-    assert same(go_on(env, [joints(env, 3)]), after)
+    assert same(resume(env, [joints(env, 3)]), after)
     env.close()
 
 

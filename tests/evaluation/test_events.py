@@ -42,7 +42,7 @@ def memoryless() -> MMEPolicy:
     return quick_policy("pi05")
 
 
-class Seen:
+class Observed:
     """What the policy knew at each decision: frames observed, the memory's selection, the current image."""
 
     def __init__(self, policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +89,7 @@ def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
         event_arms(arm)
 
 
-def test_events_of_no_length_equal_the_plain_run_to_the_last_bit(policy: MMEPolicy) -> None:
+def test_events_of_no_length_equal_the_baseline_run_to_the_last_bit(policy: MMEPolicy) -> None:
     jobs = JOBS[2:4]
     made = [
         {r.key: facts(r) for r in roll(policy, jobs, InlineEnvs(2, base=make_moving_env), max_batch=1, event=event)}
@@ -101,28 +101,28 @@ def test_events_of_no_length_equal_the_plain_run_to_the_last_bit(policy: MMEPoli
 def test_a_pause_holds_the_robot_and_memory_receives_its_frames(
     policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen, envs = Seen(policy, monkeypatch), InlineEnvs()
+    observed, envs = Observed(policy, monkeypatch), InlineEnvs()
     (record,) = roll(policy, [UNMASK], envs, event="pause:10@step:16")
     (again,) = roll(policy, [UNMASK], InlineEnvs(), event="pause:10@step:16")
-    assert seen.frames[:3] == [START + 1, START + 27, START + 43]
+    assert observed.frames[:3] == [START + 1, START + 27, START + 43]
     env = envs.made[UNMASK]
-    assert env.held == 10 and len(env.actions) == 41, "the limit grows by the pause"
+    assert env.hold_steps == 10 and len(env.actions) == 41, "the limit grows by the pause"
     assert (record.outcome, record.steps) == ("timeout", 51) and facts(again) == facts(record)
     assert record.extra["events"] == [{"event": "pause:10@step:16", "step": 16}]
     frames = np.stack(env.frames)
-    for count, selection in zip(seen.frames[:3], seen.selections, strict=False):
+    for count, selection in zip(observed.frames[:3], observed.selections, strict=False):
         offline = policy.require_memory().gather_selection(cached_history(policy, frames, exec_start=START), count - 1)
         assert torch.equal(selection.positions, offline.positions)
         assert torch.allclose(selection.features, offline.features, atol=1e-5)
 
 
 def test_frames_of_a_gap_are_not_observed(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen, envs = Seen(policy, monkeypatch), InlineEnvs()
+    observed, envs = Observed(policy, monkeypatch), InlineEnvs()
     roll(policy, [UNMASK], envs, event="gap:10@step:16")
     env = envs.made[UNMASK]
-    assert env.held == 11 and seen.frames == [START + 1, START + 18, START + 34]
+    assert env.hold_steps == 11 and observed.frames == [START + 1, START + 18, START + 34]
     frames = np.delete(np.stack(env.frames), np.arange(START + 17, START + 27), axis=0)
-    for count, selection, images in zip(seen.frames, seen.selections, seen.images, strict=True):
+    for count, selection, images in zip(observed.frames, observed.selections, observed.images, strict=True):
         front = frames[count - 1]
         assert torch.equal(images, policy.require_processor().images([front, front[::-1]]))
         offline = policy.require_memory().gather_selection(cached_history(policy, frames, exec_start=START), count - 1)
@@ -139,9 +139,9 @@ def test_images_on_demand_are_all_that_a_policy_reads_under_events(name: str) ->
 
 def test_a_video_can_be_faster_or_slower(policy: MMEPolicy, monkeypatch: pytest.MonkeyPatch) -> None:
     for event, length in (("speed:2", 10), ("speed:0.5", 42)):
-        seen = Seen(policy, monkeypatch)
+        observed = Observed(policy, monkeypatch)
         (record,) = roll(policy, [UNMASK], InlineEnvs(), event=event)
-        assert seen.frames[0] == length + 1 and record.extra["video_frames"] == length
+        assert observed.frames[0] == length + 1 and record.extra["video_frames"] == length
         monkeypatch.undo()
     (no_video,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs(), event="speed:2")
     assert no_video.extra["events"] == [{"event": "speed:2", "step": None}]
@@ -152,18 +152,18 @@ def test_a_restart_begins_the_frame_index_anew_and_keeps_what_is_remembered(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
-    seen = Seen(policy, monkeypatch)
+    observed = Observed(policy, monkeypatch)
     (record,) = roll(policy, [UNMASK], InlineEnvs(), event="restart@step:16")
     assert record.extra["events"] == [{"event": "restart@step:16", "step": 16}]
-    assert [int(selection.step) for selection in seen.selections] == [START, 0, 16]
-    last = seen.selections[2]
+    assert [int(selection.step) for selection in observed.selections] == [START, 0, 16]
+    last = observed.selections[2]
     times = last.positions[last.mask][:, 0]
     assert times.max() > 16 and (times == 16).any() and times.max() < START + 16
     monkeypatch.undo()
-    plain = Seen(policy, monkeypatch)
+    baseline = Observed(policy, monkeypatch)
     roll(policy, [UNMASK], InlineEnvs())
-    assert torch.equal(seen.selections[1].features, plain.selections[1].features)
-    assert not torch.equal(seen.selections[1].positions, plain.selections[1].positions)
+    assert torch.equal(observed.selections[1].features, baseline.selections[1].features)
+    assert not torch.equal(observed.selections[1].positions, baseline.selections[1].positions)
 
 
 def test_a_policy_whose_frames_have_no_numbers_cannot_restart(memoryless: MMEPolicy, tmp_path: Path) -> None:
@@ -174,7 +174,7 @@ def test_a_policy_whose_frames_have_no_numbers_cannot_restart(memoryless: MMEPol
 def test_events_act_by_sub_task_and_episode_by_episode(memoryless: MMEPolicy) -> None:
     envs = InlineEnvs(6)
     made = roll(memoryless, JOBS, envs, event="pause:7@subtask:20+pause:3@subtask:20")
-    assert {env.held for env in envs.made.values()} == {10}
+    assert {env.hold_steps for env in envs.made.values()} == {10}
     assert [entry["step"] for r in made for entry in r.extra["events"]] == [32] * 12  # the first decision in it
     alone = roll(memoryless, JOBS, InlineEnvs(1), event="pause:7@subtask:20+pause:3@subtask:20", max_batch=1)
     assert {(r.key, r.outcome, r.steps) for r in alone} == {(r.key, r.outcome, r.steps) for r in made}
@@ -187,7 +187,7 @@ def test_a_place_that_the_environment_does_not_tell_is_refused() -> None:
         EventCourse(read_events("pause:1@subtask:1")).next(Any, step=0, subtask=0)  # type: ignore[arg-type]
 
 
-def test_an_event_of_your_own_is_registered_by_name(policy: MMEPolicy) -> None:
+def test_a_custom_event_is_registered_by_name(policy: MMEPolicy) -> None:
     @register("event", "rename")
     class Rename(Event):
         hold, observed = 8, 5
@@ -202,7 +202,7 @@ def test_an_event_of_your_own_is_registered_by_name(policy: MMEPolicy) -> None:
 
 
 class Rail(gymnasium.Env[Any, Any]):
-    """A cart that is pushed by its action, and a lamp that goes on blinking."""
+    """A cart that is pushed by its action, and a lamp that keeps blinking."""
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.place, self.time = 0.0, 0
@@ -223,7 +223,7 @@ class Rails(Environment):
         return Rail()
 
 
-def test_an_environment_of_your_own_names_the_action_that_keeps_its_robot() -> None:
+def test_a_custom_environment_names_the_action_that_keeps_its_robot() -> None:
     class Braked(Rails):
         def hold(self, env: Rail) -> np.ndarray:
             return np.zeros(1)
@@ -248,13 +248,13 @@ def test_every_event_run_has_its_matched_arm(memoryless: MMEPolicy, tmp_path: Pa
     jobs, how = JOBS[2:4], {"base": make_slow_env, "show_progress": False}
     done = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], **how)
     assert [r.event for r in done.records] == ["pause:9@subtask:30"] * 2 + ["pause:9"] * 2
-    plain = {r.key: facts(r) for r in done.matched}
-    assert all(facts(r) == plain[r.key] for r in done.records[:2]), "its sub-task never began: the same run"
-    assert all(r.steps != plain[r.key][1] or facts(r) != plain[r.key] for r in done.records[2:])
+    baseline = {r.key: facts(r) for r in done.matched}
+    assert all(facts(r) == baseline[r.key] for r in done.records[:2]), "its sub-task never began: the same run"
+    assert all(r.steps != baseline[r.key][1] or facts(r) != baseline[r.key] for r in done.records[2:])
     again = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9"], **how)
     assert again.workload.chunks == 0 and [facts(r) for r in again.records] == [facts(r) for r in done.records[2:]]
-    found = Protocol(("VideoUnmask", "PickXtimes"), episodes=3)
-    methods = aggregate([*done.records, *done.matched], found).methods
+    protocol = Protocol(("VideoUnmask", "PickXtimes"), episodes=3)
+    methods = aggregate([*done.records, *done.matched], protocol).methods
     assert [method.label for method in methods] == ["tiny · pause:9@subtask:30", "tiny · pause:9", "tiny"]
 
 
@@ -301,17 +301,17 @@ def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     )
     assert isinstance(built, MMEPolicy)
     built.require_processor().stats = NormStats.unit(8, 10)
-    held: list[tuple[int, int, float]] = []
+    holds: list[tuple[int, int, float]] = []
     hold = RoboMMEEnv._hold
 
     def watched(env: RoboMMEEnv, run: Any, steps: int) -> None:
         before, count = np.array(env.task.qpos), run.count
         hold(env, run, steps)
-        held.append((env.task.progress.index, run.count - count, float(np.abs(env.task.qpos - before)[:7].max())))
+        holds.append((env.task.progress.index, run.count - count, float(np.abs(env.task.qpos - before)[:7].max())))
 
     monkeypatch.setattr(RoboMMEEnv, "_hold", watched)
     how: dict[str, Any] = {"oracle_share": 1.0, "render": False, "max_steps": 150, "event": "pause:30@subtask:2"}
     (paused,) = rollouts(built.eval(), "mme_vla", [Job("PickXtimes", "test", 0)], (), **how)
-    ((subtask, steps, motion),) = held
+    ((subtask, steps, motion),) = holds
     assert paused.outcome == "timeout" and paused.steps > 150
     assert (subtask, steps) == (1, 30) and motion < 0.05

@@ -72,19 +72,19 @@ def test_a_success_has_done_everything_and_the_mistake_is_that_of_the_failure() 
     assert process_score(progress, "success") == ProcessScore(1, 1)
 
 
-class ToldEnv(ScriptedEnv):
+class ReportingEnv(ScriptedEnv):
     """Also has a pointer over sub-tasks, as a simulated task has."""
 
     task = SimpleNamespace(progress=Progress([SubTask("push", lambda: False, lambda _: None)], latch_failure=True))
 
 
-def make_told_env(task: str, split: str, episode: int, max_steps: int = 40, **options: Any) -> ToldEnv:
-    return ToldEnv(task, episode, max_steps, 1e9, 0.0, "")
+def make_reporting_env(task: str, split: str, episode: int, max_steps: int = 40, **options: Any) -> ReportingEnv:
+    return ReportingEnv(task, episode, max_steps, 1e9, 0.0, "")
 
 
 def test_records_tables_and_the_report_tell_it() -> None:
     policy = quick_policy("pi05").eval()
-    (record,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs(base=make_told_env))
+    (record,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs(base=make_reporting_env))
     assert process_of(record) == ProcessScore(0, 1, "stuck", "", "push")
     (silent,) = roll(policy, [Job("PickXtimes", "test", 0)], InlineEnvs())
     assert process_of(silent) is None

@@ -16,11 +16,9 @@ from mme_vla.evaluation.results.aggregate import (
     Results,
     aggregate,
     bootstrap,
-    holm,
-    sign_test,
     wilson,
 )
-from mme_vla.evaluation.results.compare import compare, compare_all
+from mme_vla.evaluation.results.compare import compare, compare_all, holm, sign_test
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import policy_facts, training_details
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of

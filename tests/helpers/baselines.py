@@ -53,10 +53,10 @@ def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
     return uniform.mul_(torch.tensor(np.float32(np.sqrt(3 / fan))))
 
 
-def relative_error(found: Tensor, expected: Tensor) -> float:
+def relative_error(actual: Tensor, expected: Tensor) -> float:
     """Largest difference over the largest expected number; also kept under the running test's name (docs/evidence)."""
-    assert found.shape == expected.shape, (found.shape, expected.shape)
-    worst = (found.detach().double() - expected.double()).abs().max().item()
+    assert actual.shape == expected.shape, (actual.shape, expected.shape)
+    worst = (actual.detach().double() - expected.double()).abs().max().item()
     worst /= expected.abs().max().item() or 1.0
     test = os.environ.get("PYTEST_CURRENT_TEST", "").rsplit(" ", 1)[0].rsplit("::", 1)[-1]
     ERRORS[test] = max(worst, ERRORS.get(test, 0.0))

@@ -67,9 +67,9 @@ def core(sizes: dict[str, Any], weights: dict[str, Tensor]) -> MemoryVlaCore:
     return built
 
 
-def golden_name(ours: str) -> str:
-    piece = memoryvla_piece(ours)
-    assert piece is not None, ours
+def golden_name(name: str) -> str:
+    piece = memoryvla_piece(name)
+    assert piece is not None, name
     return piece.path
 
 

@@ -36,12 +36,12 @@ def parameters(golden: dict[str, Tensor], about: dict[str, Any]) -> dict[str, Te
     return ruled | stored
 
 
-def golden_name(ours: str) -> str:
+def golden_name(name: str) -> str:
     """The golden name of one of a policy's parameters: peft's wrapper stands before the model's own."""
-    if ours.startswith("memory.encoder."):
-        return ours.replace("memory.encoder.", "memory/")
-    source = openvla_name(ours)
-    assert source is not None, f"{ours} has no name"
+    if name.startswith("memory.encoder."):
+        return name.replace("memory.encoder.", "memory/")
+    source = openvla_name(name)
+    assert source is not None, f"{name} has no name"
     return source.replace(VLA, VLA + WRAPPER, 1)
 
 

@@ -45,8 +45,8 @@ def sample_weight(name: str, shape: list[int], seed: int) -> Tensor:
     return torch.from_numpy(np.asarray(value, np.float32))
 
 
-def relative_error(found: Any, expected: np.ndarray) -> float:
+def relative_error(actual: Any, expected: np.ndarray) -> float:
     """The largest difference, relative to the largest expected entry."""
-    array = found.detach().numpy() if isinstance(found, Tensor) else np.asarray(found)
+    array = actual.detach().numpy() if isinstance(actual, Tensor) else np.asarray(actual)
     assert array.shape == expected.shape, (array.shape, expected.shape)
     return float(np.abs(array - expected).max() / max(np.abs(expected).max(), 1e-30))

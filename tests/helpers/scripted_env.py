@@ -22,14 +22,14 @@ class ScriptedEnv:
     It holds its joints when told to, and names a sub-task anew after every action.
 
     Attributes:
-        actions: all it was given. held: control steps for which it held. frames: all front images it showed.
+        actions: all it was given. hold_steps: control steps for which it held. frames: all front images it showed.
     """
 
     def __init__(self, task: str, episode: int, max_steps: int, travel: float, step_s: float, dies: str) -> None:
         self.task_name, self.episode, self.max_steps = task, episode, max_steps
         self.travel, self.step_s, self.dies = travel, step_s, dies
         self.actions: list[np.ndarray] = []
-        self.held = 0
+        self.hold_steps = 0
         self.frames: list[np.ndarray] = []
         self.states: list[np.ndarray] = []
         self.joints: np.ndarray = np.zeros(7)
@@ -42,7 +42,7 @@ class ScriptedEnv:
     def step(self, action: np.ndarray | Hold) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
         time.sleep(self.step_s)
         if isinstance(action, Hold):
-            self.held += action.steps
+            self.hold_steps += action.steps
             return self._lists([self._frame() for _ in range(action.steps)]), 0.0, False, False, self._info("ongoing")
         self.actions.append(np.array(action))
         if self.dies and len(self.actions) == 20:

@@ -18,15 +18,15 @@ class WatchedEnv(ScriptedEnv):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.render_request: RenderRequest | None = None
-        self.drawn = {"front": 0, "wrist": 0}
+        self.rendered = {"front": 0, "wrist": 0}
 
     def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
         first = len(self.frames) - len(frames)
         for number, frame in enumerate(frames, first):
             newest = number == len(self.frames) - 1
             cameras = ("front", "wrist") if self.render_request is None else self.render_request.cameras(number, newest)
-            for camera in self.drawn:
-                self.drawn[camera] += camera in cameras
+            for camera in self.rendered:
+                self.rendered[camera] += camera in cameras
                 frame[f"{camera}_rgb"] = frame[f"{camera}_rgb"] if camera in cameras else None
         return super()._lists(frames)
 
@@ -50,6 +50,6 @@ def both_ways(policy: Any, subgoals: Any = None, base: Any = make_watched_env) -
         assert [record.steps for record in records] == [STEPS, STEPS], "an episode should take several chunks"
         results.append(outcomes(records))
         if base is make_watched_env:
-            counts += [env.drawn for env in envs.made.values()]
+            counts += [env.rendered for env in envs.made.values()]
     assert results[0] == results[1]
     return counts

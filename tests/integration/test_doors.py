@@ -25,8 +25,8 @@ from mme_vla.weights import load_weights, transfer
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.released import to_released
 
-SEEN = {"images", "prompt", "memory"}
-BESIDE = {**PI05_VISIBILITY, "memory": SEEN, "action": SEEN | {"action"}}
+VISIBLE = {"images", "prompt", "memory"}
+BESIDE = {**PI05_VISIBILITY, "memory": VISIBLE, "action": VISIBLE | {"action"}}
 
 
 class Beside(Integration):
@@ -38,17 +38,17 @@ class Beside(Integration):
         super().__init__(backbone)
         self.memory_width = backbone.action.width
         self.visibility = BESIDE
-        self.own = nn.Linear(self.memory_width, self._width(backbone))
+        self.project = nn.Linear(self.memory_width, self._width(backbone))
 
     def _width(self, backbone: Any) -> int:
         return int(backbone.action.width)
 
     def beside(self, memory: MemoryTokens | None) -> Sequence[Block]:
         memory = required(memory)
-        return [Block("memory", self.own(memory.tokens), memory.mask, self.expert)]
+        return [Block("memory", self.project(memory.tokens), memory.mask, self.expert)]
 
 
-class BesideInAnExpertOfItsOwn(Beside):
+class BesideInASeparateExpert(Beside):
     expert = "recall"
 
     def _width(self, backbone: Any) -> int:
@@ -58,7 +58,7 @@ class BesideInAnExpertOfItsOwn(Beside):
         return {"recall": ExpertConfig(48, 96)}
 
 
-class Everything(BesideInAnExpertOfItsOwn):
+class Everything(BesideInASeparateExpert):
     """All doors at once."""
 
     def __init__(self, backbone: Any) -> None:
@@ -66,7 +66,7 @@ class Everything(BesideInAnExpertOfItsOwn):
         self.mix = nn.Linear(self.memory_width, self.memory_width)
         self.word = nn.Linear(self.memory_width, backbone.vlm.width)
         self.visibility = {**BESIDE, "word": {"word"}, "prompt": {"word", "images", "prompt"}}
-        self.visibility["action"] = SEEN | {"word", "action"}
+        self.visibility["action"] = VISIBLE | {"word", "action"}
 
     def _mean(self, memory: MemoryTokens | None) -> Tensor:
         memory = required(memory)
@@ -110,7 +110,7 @@ class Another(FrameSamp):
         return MemoryTokens(self.encoder(history.features), history.mask)
 
 
-EXTENSION_POINTS = [Beside, BesideInAnExpertOfItsOwn, Everything]
+EXTENSION_POINTS = [Beside, BesideInASeparateExpert, Everything]
 
 
 @pytest.fixture(autouse=True)
@@ -121,7 +121,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(MEMORIES._entries, memory.__name__, memory)
 
 
-def own_policy(integration: type[Integration], memory: type = FrameSamp, seed: int = 42) -> MMEPolicy:
+def policy_of(integration: type[Integration], memory: type = FrameSamp, seed: int = 42) -> MMEPolicy:
     cfg = compose("policy", ["model=framesamp_modul", "backbone=tiny"])
     cfg.integration = {"name": integration.__name__}
     cfg.memory = {"name": "framesamp" if memory is FrameSamp else memory.__name__, "budget": 128}
@@ -131,16 +131,16 @@ def own_policy(integration: type[Integration], memory: type = FrameSamp, seed: i
     return policy
 
 
-@pytest.mark.parametrize("own", EXTENSION_POINTS)
+@pytest.mark.parametrize("integration", EXTENSION_POINTS)
 def test_an_extension_point_leads_to_the_action_in_training_and_in_every_step_of_sampling(
-    own: type[Integration],
+    integration: type[Integration],
 ) -> None:
-    check_integration(own.__name__)
+    check_integration(integration.__name__)
 
 
-@pytest.mark.parametrize("own", EXTENSION_POINTS)
-def test_a_policy_learns_and_acts_through_an_extension_point(own: type[Integration]) -> None:
-    policy = own_policy(own)
+@pytest.mark.parametrize("integration", EXTENSION_POINTS)
+def test_a_policy_learns_and_acts_through_an_extension_point(integration: type[Integration]) -> None:
+    policy = policy_of(integration)
     batch = random_batch(policy, valid=64)
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     before, _ = policy(batch, draws)
@@ -173,13 +173,14 @@ def released(tmp_path_factory: pytest.TempPathFactory) -> tuple[MMEPolicy, Path]
 
 
 @pytest.mark.parametrize(
-    ("own", "memory"), [*[(o, FrameSamp) for o in EXTENSION_POINTS], (Beside, Weighted), (Beside, Another)]
+    ("integration", "memory"),
+    [*[(o, FrameSamp) for o in EXTENSION_POINTS], (Beside, Weighted), (Beside, Another)],
 )
 def test_only_the_custom_component_is_new_when_starting_from_a_released_checkpoint(
-    own: type[Integration], memory: type, released: tuple[MMEPolicy, Path]
+    integration: type[Integration], memory: type, released: tuple[MMEPolicy, Path]
 ) -> None:
     source, folder = released
-    policy, released_state = own_policy(own, memory), source.state_dict()
+    policy, released_state = policy_of(integration, memory), source.state_dict()
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     start = transfer(policy, folder)
     assert set(start.new) == set(before) - set(released_state)
@@ -192,7 +193,7 @@ def test_only_the_custom_component_is_new_when_starting_from_a_released_checkpoi
 
 def test_loading_all_of_one_says_which_tensors_have_no_released_names(released: tuple[MMEPolicy, Path]) -> None:
     with pytest.raises(UserError, match=r"(?s)experts\.recall\.attention_norm.*and 4 more.*start_from\(\)"):
-        load_weights(own_policy(BesideInAnExpertOfItsOwn), released[1])
+        load_weights(policy_of(BesideInASeparateExpert), released[1])
 
 
 def test_the_memoryless_ports_start_a_custom_integration_too(tmp_path: Path) -> None:
@@ -200,7 +201,7 @@ def test_the_memoryless_ports_start_a_custom_integration_too(tmp_path: Path) -> 
 
     small_policy("pi05", seed=5).save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
-    policy = own_policy(Everything)
+    policy = policy_of(Everything)
     start = transfer(policy, tmp_path / "lerobot")
     component = policy.finetune_spec.component_of
     assert set(start.new) == {name for name in policy.state_dict() if component(name) == "memory"}

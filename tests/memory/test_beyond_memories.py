@@ -57,7 +57,7 @@ def encoded(memory: Any, tokens: torch.Tensor, step: int | None = None, exec_sta
 # Retrieval
 
 
-def rooms(order: str, stay: int) -> torch.Tensor:
+def scene_sequence(order: str, stay: int) -> torch.Tensor:
     """An episode that stays `stay` frames in each of several places, whose tokens differ but for a little noise."""
     places = {name: noise(4, D, seed=ord(name)) for name in sorted(set(order))}
     features = torch.stack([places[name] for name in order for _ in range(stay)])
@@ -66,10 +66,10 @@ def rooms(order: str, stay: int) -> torch.Tensor:
 
 def test_retrieval_stores_where_it_was_before_and_drops_all_else() -> None:
     memory = Retrieval(D, 16, budget=4 * 10, grid=2, every=1, cut=0.8, longest=6)
-    frames = sorted(set(memory.select(stored(memory, rooms("ABCDEB", 6)), 35)[:, 0].tolist()))
+    frames = sorted(set(memory.select(stored(memory, scene_sequence("ABCDEB", 6)), 35)[:, 0].tolist()))
     assert frames[-1] == 35 and len(frames) == 10
     assert set(range(6, 12)) <= set(frames), "the six frames in B"
-    after_move = sorted(set(memory.select(stored(memory, rooms("ABCDEC", 6)), 35)[:, 0].tolist()))
+    after_move = sorted(set(memory.select(stored(memory, scene_sequence("ABCDEC", 6)), 35)[:, 0].tolist()))
     assert set(range(12, 18)) <= set(after_move) and not set(range(6, 12)) <= set(after_move)
 
 
@@ -115,7 +115,7 @@ def test_gist_keeps_all_of_the_beginning_and_the_end_and_a_few_tokens_of_all_bet
     assert tokens.ages is not None and tokens.mask.all()
     assert tokens.ages[0].tolist() == [7.0] * 4 + [6.0] * 3 + [5.0] * 3 + [4.0] * 3 + [3.0] * 3 + [2.0] * 3 + [
         1.0] * 4 + [0.0] * 4  # fmt: skip
-    long = memory.chosen(500, 200)
+    long = memory.selected_frames(500, 200)
     assert len(long) == 8 and (long[0], long[-2], long[-1]) == (0, 499, 500)
     assert np.diff(long[1:-2]).min() > 80, "more frames than there is room for are kept evenly spaced"
     assert encoded(memory, noise(2, 4, D)).mask.sum() == 8, "a short episode is whole"

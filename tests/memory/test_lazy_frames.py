@@ -18,13 +18,13 @@ def numbered(frames: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(frames[:, 0, 0, :1].astype(np.float32))[:, None] + torch.arange(4)[:, None] / 10
 
 
-def pictures(count: int) -> np.ndarray:
+def numbered_images(count: int) -> np.ndarray:
     return np.arange(count, dtype=np.uint8)[:, None, None, None].repeat(3, 3)
 
 
-@pytest.mark.parametrize("drawn", [None, np.array([1, 2, 3, 5])])
-def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -> None:
-    expected = pictures(6) if drawn is None else pictures(6)[drawn]
+@pytest.mark.parametrize("rendered", [None, np.array([1, 2, 3, 5])])
+def test_a_lazy_history_holds_what_an_eager_one_does(rendered: np.ndarray | None) -> None:
+    expected = numbered_images(6) if rendered is None else numbered_images(6)[rendered]
     encoded: list[int] = []
 
     def encode(frames: np.ndarray) -> torch.Tensor:
@@ -32,7 +32,7 @@ def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -
         return numbered(frames)
 
     lazy, eager = LazyHistory(SPEC, encode), OnlineHistory(SPEC)
-    batch = FrameBatch.of(expected, drawn, 6)
+    batch = FrameBatch.of(expected, rendered, 6)
     lazy.take(batch, encode)
     eager.take(batch, numbered)
     assert encoded == [] and len(lazy) == len(eager) == 6

@@ -32,7 +32,7 @@ def build(name: str, **options: Any) -> Memory:
     return memory.eval()
 
 
-def moved(history: HistoryTokens, *by: float) -> HistoryTokens:
+def shifted(history: HistoryTokens, *by: float) -> HistoryTokens:
     """The selection at other times, rows or columns."""
     return replace(history, positions=(history.positions + torch.tensor(by)) * history.mask[..., None])
 
@@ -45,7 +45,7 @@ def test_tokens_say_of_their_place_what_positions_allows(name: str) -> None:
     for positions in ("time_space", "space", "none"):
         memory = build(name, positions=positions)
         base = memory(history)
-        for what, other in (("time", moved(history, 100, 0, 0)), ("space", moved(history, 0, 3, 2))):
+        for what, other in (("time", shifted(history, 100, 0, 0)), ("space", shifted(history, 0, 3, 2))):
             tokens = memory(other).tokens
             changes[positions, what] = not torch.equal(tokens[base.mask], base.tokens[base.mask])
         if positions == "time_space":

@@ -1,4 +1,4 @@
-"""A full window moves at every decision: what its next one needs is prepared while nobody waits, to the same bit."""
+"""A full window moves at every decision: what its next one needs is prepared between requests, to the same bit."""
 
 from functools import partial
 
@@ -154,7 +154,7 @@ def test_rollouts_prepare_between_chunks(monkeypatch):
     monkeypatch.setattr(policy, "prepare", lambda episode: calls.append(episode.n_observed_frames) or prepare(episode))
 
     class Slow(InlineEnvs):
-        """Answers when it is asked again, as a simulation does."""
+        """Returns frames when it is queried again, as a simulation does."""
 
         waited = False
 

@@ -19,22 +19,22 @@ D = 16
 
 
 def test_anchors_keep_the_first_frame_and_the_last_ones() -> None:
-    assert Anchors(D, 8).chosen(100, 0).tolist() == [0, 99, 100]
-    assert Anchors(D, 8, budget=64, spacing=15).chosen(100, 0).tolist() == [0, 70, 85, 100]
-    assert [Anchors(D, 8).chosen(step, 0).tolist() for step in (0, 1)] == [[0], [0, 1]]
+    assert Anchors(D, 8).selected_frames(100, 0).tolist() == [0, 99, 100]
+    assert Anchors(D, 8, budget=64, spacing=15).selected_frames(100, 0).tolist() == [0, 70, 85, 100]
+    assert [Anchors(D, 8).selected_frames(step, 0).tolist() for step in (0, 1)] == [[0], [0, 1]]
     with pytest.raises(UserError, match="at least 2: choose a multiple of 16, such as 32"):
         Anchors(D, 8, budget=16)
 
 
 def test_a_pyramid_thins_with_age_and_never_takes_back_a_dropped_frame() -> None:
     memory = Pyramid(D, 8, budget=512)
-    kept = memory.chosen(1299, 0)
-    assert kept[0] == 0 and len(kept) == 32 and memory.sizes == [8, 8, 8, 7]
-    ages = 1299 - kept[::-1]
+    selected = memory.selected_frames(1299, 0)
+    assert selected[0] == 0 and len(selected) == 32 and memory.sizes == [8, 8, 8, 7]
+    ages = 1299 - selected[::-1]
     assert ages[:8].tolist() == list(range(0, 16, 2)) and ages[8:16].tolist() == list(range(20, 84, 8))
     before: set[int] = set()
     for step in range(1500):
-        now = set(memory.chosen(step, 0).tolist())
+        now = set(memory.selected_frames(step, 0).tolist())
         assert len(now) <= 32 and now - before <= {step}, "only the new frame joins"
         before = now
     with pytest.raises(UserError, match="multiple of the one before it"):
@@ -58,8 +58,8 @@ def kinematic_history(memory: Events, length: int = 200) -> CachedHistory:
 
 def test_events_keep_frames_where_something_happens() -> None:
     memory = Events(D, 8, budget=16 * 5)
-    kept = np.unique(memory.select(kinematic_history(memory), 199)[:, 0])
-    assert kept.tolist() == [0, 63, 103, 151, 199]
+    selected = np.unique(memory.select(kinematic_history(memory), 199)[:, 0])
+    assert selected.tolist() == [0, 63, 103, 151, 199]
     early = np.unique(memory.select(kinematic_history(memory), 120)[:, 0])
     assert early.tolist() == [0, 63, 103, 119], "what has not happened yet is not known"
     assert peaks(np.array([0, 2, 1, 1, 3, 3, 0])).tolist() == [False, True, False, False, True, False, False]
@@ -71,8 +71,8 @@ def boundaries_batch(memory: Keyframes, rng: np.random.Generator):
     for _ in range(10):
         cuts = np.sort(rng.choice(np.arange(4, 38, 3), 3, replace=False))
         subtask = np.searchsorted(cuts, np.arange(40), side="right")
-        looks = torch.from_numpy(rng.normal(size=(4, D)).astype(np.float32))
-        tokens = (looks[subtask][:, None] + 0.1 * torch.randn(40, 16, D)).numpy()
+        appearances = torch.from_numpy(rng.normal(size=(4, D)).astype(np.float32))
+        tokens = (appearances[subtask][:, None] + 0.1 * torch.randn(40, 16, D)).numpy()
         item = memory.gather_selection(CachedHistory(memory.storage, tokens, np.arange(40), 40), 39)
         item.labels = Labels({LABEL: torch.from_numpy(np.repeat(subtask, 16).astype(np.float32) + 1)})
         items.append(item)
@@ -91,9 +91,9 @@ def test_the_write_head_learns_sub_task_boundaries_and_keeps_them() -> None:
         optimizer.step()
     history, begins = boundaries_batch(memory, rng)
     tokens = memory(history)
-    kept = 39 - tokens.ages[:, ::16].long()
-    assert float(begins.gather(1, kept).float().sum() / begins.sum()) > 0.9
-    assert (kept[:, 0] == 0).all() and (kept[:, -1] == 39).all(), "the first and the newest are there in any case"
+    selected = 39 - tokens.ages[:, ::16].long()
+    assert float(begins.gather(1, selected).float().sum() / begins.sum()) > 0.9
+    assert (selected[:, 0] == 0).all() and (selected[:, -1] == 39).all(), "first and newest are always there"
     history.labels = Labels()
     assert not memory(history).losses, "episodes have no labels"
 

@@ -83,7 +83,7 @@ def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> 
 
 def test_users_rows_are_compared_with_the_rows_beside_the_best_and_the_floors(rows: Path, tmp_path: Path) -> None:
     write_training(tmp_path, "mine", 0, {"BinFill": 3, "VideoUnmask": 2})
-    board = Board(read_rows([rows], own=[tmp_path]), samples=50)
+    board = Board(read_rows([rows], local=[tmp_path]), samples=50)
     pairs = [(c.first, c.second) for c in board.neighbours()]
     assert pairs == [
         ("ttt_modul", "mine"),
@@ -97,8 +97,8 @@ def test_users_rows_are_compared_with_the_rows_beside_the_best_and_the_floors(ro
 
 def test_a_users_row_of_a_known_name_stands_beside_it(rows: Path, tmp_path: Path) -> None:
     write_training(tmp_path, "ttt_modul", 0, 3)
-    read = read_rows([rows], own=[tmp_path])
-    assert len(read["ttt_modul"]) == 2 and [t.is_own for t in read["ttt_modul (yours)"]] == [True]
+    read = read_rows([rows], local=[tmp_path])
+    assert len(read["ttt_modul"]) == 2 and [t.is_local for t in read["ttt_modul (yours)"]] == [True]
 
 
 def test_targets_have_intervals_and_are_not_reached_by_weak_evidence(board: Board, tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_the_homogeneity_test_keeps_its_level() -> None:
     assert 0.01 < np.mean(np.array(p_values) <= 0.05) < 0.1
 
 
-def test_separations_state_spread_noise_floor_and_ceiling(board: Board) -> None:
+def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> None:
     made = board.separations()
     assert [s.task for s in made] == list(board.protocol.tasks) and all(s.memories == 3 for s in made)
     first = made[0]
@@ -144,7 +144,7 @@ def test_separations_state_spread_noise_floor_and_ceiling(board: Board) -> None:
     assert board_page.separating(board)[0].startswith("At the default budgets 0 of 4 tasks separate the 3 memories")
 
 
-def test_budgets_are_tables_of_their_own(rows: Path, tmp_path: Path) -> None:
+def test_budgets_are_separate_tables(rows: Path, tmp_path: Path) -> None:
     for row in ("framesamp_modul@4", "ttt_modul@4", "framesamp_modul@16"):
         write_training(tmp_path, row, 0, 1, budget=int(row.partition("@")[2]))
     board = Board(read_rows([rows, tmp_path]), samples=50)
@@ -183,11 +183,11 @@ def test_the_page_holds_the_numbers(board: Board) -> None:
 
 def test_compressed_records_are_the_same(tmp_path: Path) -> None:
     folder = write_training(tmp_path, "framesamp_modul", 0, 3)
-    plain = folder / "episodes.jsonl"
+    unpacked = folder / "episodes.jsonl"
     packed = folder / "episodes.jsonl.xz"
     records = read_training(folder).records
-    packed.write_bytes(lzma.compress(plain.read_bytes()))
-    plain.unlink()
+    packed.write_bytes(lzma.compress(unpacked.read_bytes()))
+    unpacked.unlink()
     assert read_training(folder).records == records
     assert len(read_folders([packed])) == SCENES * len(TASKS)
     packed.write_bytes(packed.read_bytes()[:-40])
@@ -213,7 +213,7 @@ def test_an_episode_twice_is_named(tmp_path: Path) -> None:
         read_training(folder)
 
 
-def test_a_split_that_is_not_whole_is_named(tmp_path: Path) -> None:
+def test_an_incomplete_split_is_named(tmp_path: Path) -> None:
     folder = write_training(tmp_path, "framesamp_modul", 0, 3)
     write_records(folder, records_of(folder)[:-2])
     with pytest.raises(UserError, match=r"first 3 scenes .* it lacks MoveCube 1, MoveCube 2, and has none"):
@@ -301,7 +301,7 @@ def test_a_folder_without_rows_is_refused(tmp_path: Path) -> None:
         read_rows([tmp_path / "none"])
 
 
-def test_the_command_prints_the_board_and_writes_the_page(
+def test_the_command_prints_the_board_and_creates_the_page(
     rows: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_training(tmp_path, "mine", 0, 2)

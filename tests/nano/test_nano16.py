@@ -28,7 +28,7 @@ def policy(model: str, **others: object) -> MMEPolicy:
     return build_policy(model, policy={"augment": False}, **robot, **others)
 
 
-def chosen(letters: str, task: str = "StopCube") -> Demonstration:
+def demonstration_of(letters: str, task: str = "StopCube") -> Demonstration:
     """A demonstration of these choices, b with a point."""
     targets = np.zeros((len(letters), 10), np.float32)
     targets[:, 8:] = 0.5
@@ -49,14 +49,14 @@ def test_present_gives_the_current_frame_and_as_many_parameters_as_a_memory() ->
     counts = [sum(p.numel() for p in part.parameters()) for part in (present, remembering)]
     assert counts[0] == counts[1] and present.require_memory().budget == 16
     assert present.frames_read(np.array([3, 9]), 0).tolist() == [3, 9]
-    made = chosen("ab")
+    made = demonstration_of("ab")
     present.require_processor().stats = statistics([made], present)
     history = Decisions.of(present, [made]).batch.history
     assert history is not None and history.positions[:, :, 0].float().std(1).max() == 0
 
 
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    blind, demonstrations = policy("pi05").eval(), [chosen("abb"), chosen("ab", "BinFill")]
+    blind, demonstrations = policy("pi05").eval(), [demonstration_of("abb"), demonstration_of("ab", "BinFill")]
     blind.require_processor().stats = statistics(demonstrations, blind)
     decisions = Decisions.of(blind, demonstrations)
     assert decisions.batch.actions is not None
@@ -70,14 +70,14 @@ def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) 
 def test_frequent_moves_are_those_of_most_demonstrations_at_each_place(tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.npz" for number in range(3)]
     for file, letters in zip(files, ("ab", "ab", "b"), strict=True):
-        chosen(letters).save(file)
+        demonstration_of(letters).save(file)
     (moves,) = frequent_moves(files, policy("pi05").embodiment.action).values()
     assert [move["choice"] for move in moves] == ["a", "b"] and moves[1]["point"] == pytest.approx(
         [63.75, 191.25], abs=1
     )
 
 
-def test_what_is_not_possible_is_listed_and_not_chosen() -> None:
+def test_what_is_not_possible_is_listed_and_not_selected() -> None:
     space = policy("pi05").embodiment.action
     options = (Option("a", "press"), Option("b", "pick up", True, possible=False))
     scores = np.zeros((1, 10), np.float32)
@@ -86,7 +86,7 @@ def test_what_is_not_possible_is_listed_and_not_chosen() -> None:
     assert "b pick up" in space.worded("do it", options)
 
 
-def test_what_is_possible_is_asked_again_after_each_choice() -> None:
+def test_what_is_possible_is_queried_again_after_each_choice() -> None:
     def info(possible: bool) -> dict[str, object]:
         option = {"label": "b", "action": "pick up", "need_parameter": False, "possible": possible}
         return {"task_goal": ["do it"], "available_multi_choices": [option], "executed": 1, "steps": 1}

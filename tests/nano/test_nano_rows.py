@@ -29,7 +29,7 @@ def nano(model: str) -> MMEPolicy:
     return build_policy(model, backbone="nano", embodiment="robomme_waypoint_front", policy={"augment": False}, **words)
 
 
-def drawn_for(policy: MMEPolicy) -> Demonstration:
+def rendered_for(policy: MMEPolicy) -> Demonstration:
     decisions = np.array([66, 120, 155])
     return demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
 
@@ -37,7 +37,7 @@ def drawn_for(policy: MMEPolicy) -> Demonstration:
 @pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt"])
 def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
     policy = nano(f"{memory}_modul").eval()
-    made = drawn_for(policy)
+    made = rendered_for(policy)
     policy.require_processor().stats = statistics([made], policy)
     batch = Decisions.of(policy, [made]).collate([0])
     images = made.images["front"]
@@ -56,7 +56,7 @@ def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
 @pytest.mark.parametrize(("model", "words"), [("simplesg", "pick it up"), ("groundsg", "pick it up at <")])
 def test_a_model_that_reads_subgoals_learns_from_what_the_simulator_says(model: str, words: str) -> None:
     policy = nano(model)
-    made = drawn_for(policy)
+    made = rendered_for(policy)
     processor = policy.require_processor()
     processor.stats = statistics([made], policy)
     batch = Decisions.of(policy, [made]).batch
@@ -74,7 +74,7 @@ def nano_like(policy: MMEPolicy) -> MMEPolicy:
 
 def test_the_error_is_measured_where_the_arm_goes_to_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = nano("pi05").eval()
-    made = drawn_for(policy)
+    made = rendered_for(policy)
     policy.require_processor().stats = statistics([made], policy)
     decisions = Decisions.of(policy, [made])
     batch = decisions.collate(decisions.distant.nonzero()[:, 0].tolist())
@@ -103,9 +103,9 @@ def test_tokens_are_made_once_for_a_tower_and_again_for_other_frames_or_scores(
     file = tmp_path / "VideoUnmask" / "easy-3.npz"
     file.parent.mkdir()
     demonstration().save(file)
-    plain = TokenStore.of(tmp_path / "tokens", [nano("framesamp_modul").config, nano("pi05").config])
-    read = plain.read(file)
-    assert read.tokens["front"].shape == (12, 64, 96) and not read.scores and len(plain.read(file).frames) == 1
+    baseline = TokenStore.of(tmp_path / "tokens", [nano("framesamp_modul").config, nano("pi05").config])
+    read = baseline.read(file)
+    assert read.tokens["front"].shape == (12, 64, 96) and not read.scores and len(baseline.read(file).frames) == 1
     assert encoded == [12]
     scored = TokenStore.of(tmp_path / "tokens", [nano("tokendrop_modul").config])
     policy = nano("tokendrop_modul")

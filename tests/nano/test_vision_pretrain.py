@@ -51,23 +51,23 @@ def save_scene(path: Path, size: int = 32) -> Path:
 class LabelTower(nn.Module):
     """Says what the labels of `scenes` say, moved by so much of an image; `only` of one class."""
 
-    def __init__(self, scenes: Scenes, moved: float = 0.0, only: int | None = None) -> None:
+    def __init__(self, scenes: Scenes, shifted: float = 0.0, only: int | None = None) -> None:
         super().__init__()
-        kept = torch.ones(len(scenes.classes), dtype=torch.bool) if only is None else scenes.classes == only
-        places = scenes.places[kept] + torch.tensor([moved, 0.0])
-        self.presence, self.offsets = label_cells(scenes.owners[kept], scenes.classes[kept], places, (2, 32))
+        selected = torch.ones(len(scenes.classes), dtype=torch.bool) if only is None else scenes.classes == only
+        places = scenes.places[selected] + torch.tensor([shifted, 0.0])
+        self.presence, self.offsets = label_cells(scenes.owners[selected], scenes.classes[selected], places, (2, 32))
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         return (self.presence - 0.5) * 20, self.offsets
 
 
-def test_an_object_is_labelled_in_the_four_cells_around_it_and_found_again() -> None:
+def test_an_object_is_labelled_in_the_four_cells_around_it_and_detected() -> None:
     places = torch.tensor([[0.41, 0.23], [0.47, 0.23], [0.9, 0.01]])
     presence, offsets = label_cells(torch.tensor([0, 0, 1]), torch.tensor([RED, RED, BUTTON]), places, (2, 32))
     assert presence[0, RED].sum() == 8 and presence[1, BUTTON].sum() == 2 and presence.sum() == 10
     assert offsets.abs().max() <= 1
-    found = sorted(find_objects(presence[0, RED], offsets[0, RED]))
-    assert torch.allclose(torch.tensor(found), places[:2], atol=1e-5)
+    detected = sorted(find_objects(presence[0, RED], offsets[0, RED]))
+    assert torch.allclose(torch.tensor(detected), places[:2], atol=1e-5)
 
 
 def test_labels_move_with_their_image() -> None:
@@ -75,9 +75,9 @@ def test_labels_move_with_their_image() -> None:
     images, place = torch.full((4, 3, 64, 64), -1.0), torch.tensor([[20.5, 30.5]]) / 64
     images[:, :, 30, 20] = 1
     rng = np.random.default_rng(1)
-    moved, places = augmented(images, place.repeat(4, 1), torch.arange(4), rng)
+    shifted, places = augmented(images, place.repeat(4, 1), torch.arange(4), rng)
     assert len({float(p[0]) for p in places}) == 2  # mirrored or not
-    for image, (column, row) in zip(moved, places * 64, strict=True):
+    for image, (column, row) in zip(shifted, places * 64, strict=True):
         assert image[0, int(row), int(column)] == 1
 
 
@@ -96,15 +96,15 @@ def test_a_pixels_ray_meets_the_plane_where_the_point_was() -> None:
         assert np.allclose(on_plane((column, row), point[2]), point[:2], atol=1e-6)
 
 
-def test_the_evaluation_counts_places_found_errors_and_wrong_reports(tmp_path: Path) -> None:
+def test_the_evaluation_counts_places_detections_errors_and_wrong_reports(tmp_path: Path) -> None:
     made = Scenes.load([save_scene(tmp_path / "a.npz")])
     right = evaluate_tower(LabelTower(made), made)  # type: ignore[arg-type]
     assert (right["red cube"].places, right["red cube"].reports, right["hand"].places) == (2, 2, 0)
     assert len(right["red cube"].errors) == 2 and right["red cube"].errors.max() < 0.01
-    aside = evaluate_tower(LabelTower(made, moved=0.01), made)["red cube"]  # type: ignore[arg-type]
+    aside = evaluate_tower(LabelTower(made, shifted=0.01), made)["red cube"]  # type: ignore[arg-type]
     assert len(aside.errors) == 2 and 0.5 < np.median(aside.errors) < 2
-    far = evaluate_tower(LabelTower(made, moved=0.2), made)["red cube"]  # type: ignore[arg-type]
-    assert (len(far.errors), far.reports) == (0, 2)
+    distant = evaluate_tower(LabelTower(made, shifted=0.2), made)["red cube"]  # type: ignore[arg-type]
+    assert (len(distant.errors), distant.reports) == (0, 2)
     blind = evaluate_tower(LabelTower(made, only=BUTTON), made)  # type: ignore[arg-type]
     assert "| red cube | 2 | 0 % |  | 0 % |" in report(blind) and "| button | 1 | 100 % | 0.0 cm | 0 % |" in report(
         blind

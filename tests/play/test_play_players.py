@@ -29,7 +29,7 @@ def says(name):
 
 
 @pytest.mark.parametrize(
-    ("answer", "choice", "point"),
+    ("reply", "choice", "point"),
     [
         ('{"choice": "a", "point": [500, 250]}', "a", [128, 64]),
         ('The {blue} block.\n```json\n{"choice": "(A)", "point": [0, 1000]}\n```', "a", [0, 255]),
@@ -38,12 +38,12 @@ def says(name):
         ('{"choice": "b"} {not json}', "b", None),
     ],
 )
-def test_the_last_object_of_a_reply_counts(answer, choice, point):
-    assert parse_choice(answer, OPTIONS) == {"choice": choice, "point": point}
+def test_the_last_object_of_a_reply_counts(reply, choice, point):
+    assert parse_choice(reply, OPTIONS) == {"choice": choice, "point": point}
 
 
 @pytest.mark.parametrize(
-    ("answer", "reason"),
+    ("reply", "reason"),
     [
         ("  ", "empty"),
         ("a", "no JSON object"),
@@ -61,9 +61,9 @@ def test_the_last_object_of_a_reply_counts(answer, choice, point):
         ('{"choice": "a", "point": ' + 100_000 * "[" + 100_000 * "]" + "}", "no JSON object"),
     ],
 )  # the long ones are more than Python reads
-def test_a_reply_that_cannot_be_used_says_why(answer, reason):
+def test_a_reply_that_cannot_be_used_says_why(reply, reason):
     with pytest.raises(MalformedReply, match=reason):
-        parse_choice(answer, OPTIONS)
+        parse_choice(reply, OPTIONS)
 
 
 # Gemini -----------------------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ def test_a_broken_memory_is_reported_which_prefix_it_breaks(
 
 
 class _Unread(Context):
-    """Memory is in the prefix and nobody may look at it."""
+    """Memory is in the prefix and no block may attend to it."""
 
     def __init__(self, backbone: Any) -> None:
         super().__init__(backbone)

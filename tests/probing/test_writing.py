@@ -30,7 +30,7 @@ def synthetic(length: int = 300, exec_start: int = 100, number: int = 0) -> Evid
 
 
 @pytest.mark.parametrize(
-    ("kept", "precision", "recall", "lags"),
+    ("selection", "precision", "recall", "lags"),
     [
         (lambda step: [0, 20], 1.0, 1.0, [0, 0]),  # a selection that knows the future holds each fact at once
         (lambda step: [0, step], 0.5, 0.5, [0, 0]),  # `b` is held while it is seen, and then lost
@@ -39,9 +39,9 @@ def synthetic(length: int = 300, exec_start: int = 100, number: int = 0) -> Evid
         (lambda step: [], 0.0, 0.0, []),
     ],
 )
-def test_precision_recall_and_lag_of_a_known_selection(kept, precision, recall, lags) -> None:
+def test_precision_recall_and_lag_of_a_known_selection(selection, precision, recall, lags) -> None:
     score = score_episode(
-        lambda step: np.array([f for f in kept(step) if f <= step], np.int64), FACTS, length=50, exec_start=32
+        lambda step: np.array([f for f in selection(step) if f <= step], np.int64), FACTS, length=50, exec_start=32
     )
     assert score is not None and score.facts == 2
     assert (score.precision, score.recall) == pytest.approx((precision, recall))

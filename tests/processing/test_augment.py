@@ -13,7 +13,7 @@ from mme_vla.processing.images import augment_views, augmentation_draws, crop_an
 VIEWS = ("all", "colour")
 
 
-def pictures(batch: int = 4, size: int = 40) -> Tensor:
+def random_images(batch: int = 4, size: int = 40) -> Tensor:
     return torch.rand(batch, 2, 3, size, size, generator=torch.Generator().manual_seed(0)) * 2 - 1
 
 
@@ -22,13 +22,13 @@ def augmented(images: Tensor, seed: int = 7) -> Tensor:
 
 
 def test_same_generator_gives_same_images_and_another_seed_others() -> None:
-    images = pictures()
+    images = random_images()
     assert torch.equal(augmented(images), augmented(images))
     assert not torch.equal(augmented(images), augmented(images, seed=8))
 
 
 def test_wrist_views_are_never_shifted_and_half_of_them_not_touched() -> None:
-    images = pictures(batch=200, size=8)
+    images = random_images(batch=200, size=8)
     result = augmented(images)
     untouched = (result[:, 1] - images[:, 1]).abs().amax((1, 2, 3)) < 1e-6
     assert 70 <= untouched.sum() <= 130
@@ -94,6 +94,6 @@ def test_colour_jitter_works_on_the_hsv_value_and_hue(
 
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(UserError, match="2 views but 1 cameras"):
-        augment_views(pictures(), VIEWS[:1], augmentation_draws(4))
+        augment_views(random_images(), VIEWS[:1], augmentation_draws(4))
     with pytest.raises(UserError, match="square"):
         augment_views(torch.zeros(1, 2, 3, 8, 9), VIEWS, augmentation_draws(1))

@@ -103,9 +103,9 @@ def test_many_episodes_are_queried_in_one_batch_and_only_those_that_are_due():
     assert predictor.usage.calls == 3 and predictor.usage.input_tokens == 300 and predictor.usage.output_tokens == 21
 
 
-@pytest.mark.parametrize(("answer", "problem"), [("", "empty"), ("pick <|box_start|>(1", "malformed")])
-def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(answer, problem, caplog):
-    predictor = QwenVL("grounded", vlm=Scripted(answer, "press", answer))
+@pytest.mark.parametrize(("reply_text", "problem"), [("", "empty"), ("pick <|box_start|>(1", "malformed")])
+def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(reply_text, problem, caplog):
+    predictor = QwenVL("grounded", vlm=Scripted(reply_text, "press", reply_text))
     episode = at_start(predictor)
     assert predictor.predict([episode])[0].text is None, "there is none to keep"
     advance(episode)
@@ -113,7 +113,7 @@ def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(answer, problem
     advance(episode)
     with caplog.at_level(logging.WARNING):
         subgoal = predictor.predict([episode])[0]
-    assert (subgoal.text, subgoal.problem, subgoal.reply) == ("press", problem, answer)
+    assert (subgoal.text, subgoal.problem, subgoal.reply) == ("press", problem, reply_text)
     assert predictor.usage.problems == {problem: 2} and problem in caplog.text
     assert episode.history.entries == ["press"]
 
@@ -221,7 +221,7 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
         assert {k: v for k, v in defaults.items() if k not in ("vlm", "client")} == keys
 
 
-def steps_asked(predictor, execute, chunks, task=""):
+def query_steps(predictor, execute, chunks, task=""):
     episode = at_start(predictor, task=task)
     steps = []
     for _ in range(chunks):
@@ -241,14 +241,14 @@ def steps_asked(predictor, execute, chunks, task=""):
 )
 def test_no_question_is_dropped_whatever_the_length_of_a_chunk(interval, execute, expected):
     predictor = QwenVL("simple", interval=interval, vlm=Scripted(*["a"] * 10))
-    assert steps_asked(predictor, execute, -(-160 // execute) + (execute == 20)) == expected
+    assert query_steps(predictor, execute, -(-160 // execute) + (execute == 20)) == expected
 
 
 def test_what_came_due_while_a_subgoal_was_fixed_is_left_out():
     predictor = QwenVL("simple", interval=48, vlm=Scripted("press", "pick", "put"))
-    assert steps_asked(predictor, 16, 12, "ButtonUnmask") == [0, 96, 144]
+    assert query_steps(predictor, 16, 12, "ButtonUnmask") == [0, 96, 144]
     predictor = QwenVL("simple", interval=32, vlm=Scripted(*["press the first button"] * 3))
-    assert steps_asked(predictor, 16, 9, "ButtonUnmaskSwap") == [0, 128], "112 would answer what came due at 96"
+    assert query_steps(predictor, 16, 9, "ButtonUnmaskSwap") == [0, 128], "112 would answer what came due at 96"
 
 
 def test_an_episode_that_is_joined_late_is_queried_at_once():

@@ -18,7 +18,7 @@ from mme_vla.weights.orbax import read_orbax, write_orbax
 pytest.importorskip("tensorstore", reason="reading Orbax checkpoints needs the extra 'orbax'")
 
 DATA = Path(__file__).resolve().parents[1] / "data"
-RUN, PLAIN = DATA / "orbax_run", DATA / "orbax_plain"
+RUN, BASELINE = DATA / "orbax_run", DATA / "orbax_plain"
 CASE = "model_perceptual-tokendrop-modul"
 
 
@@ -35,7 +35,7 @@ def test_every_leaf_is_what_orbax_wrote() -> None:
 
 
 def test_unboxed_layout_reads_with_and_without_outer_names() -> None:
-    tree = read_orbax(PLAIN)
+    tree = read_orbax(BASELINE)
     assert set(tree) == {"PaliGemma/img/embedding/bias", "time_mlp_in/kernel", "scale"}
     assert tree["PaliGemma/img/embedding/bias"].tolist() == [0, 1, 2, 3, 4, 5]
     assert tree["time_mlp_in/kernel"].dtype == torch.bfloat16
@@ -100,5 +100,5 @@ def test_all_leaves_that_do_not_fit_are_listed_together(tmp_path: Path) -> None:
     policy = small_policy("framesamp_modul")
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     with pytest.raises(UserError, match=r"(?s)orbax_plain.*missing.*unexpected:\s+scale.*2 misshapen"):
-        load_weights(policy, PLAIN)
+        load_weights(policy, BASELINE)
     assert all(torch.equal(tensor, before[name]) for name, tensor in policy.state_dict().items())

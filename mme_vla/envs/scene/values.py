@@ -33,7 +33,7 @@ class Values:
     """
 
     def __init__(self, spec: Mapping[str, Any] | None = None, where: str = "The scene") -> None:
-        self.given = spec is not None
+        self.specified = spec is not None
         """Values are read, and nothing is sampled."""
         self.spec: dict[str, Any] = copy.deepcopy(dict(spec or {}))
         self._where = where
@@ -50,7 +50,7 @@ class Values:
         Raises:
             UserError: the row lacks the value, or it is not of the kind that sampling gives.
         """
-        if not self.given:
+        if not self.specified:
             value = sample()
             self.note(name, value)
             return value
@@ -62,7 +62,7 @@ class Values:
     def place(self, name: str, sample: Callable[[], Any], size: int = 2) -> list[float]:
         """`size` numbers, the first two of which are a place on the table."""
         value = self(name, lambda: [float(v) for v in sample()])
-        return value if not self.given else self.check_place(name, value, size)
+        return value if not self.specified else self.check_place(name, value, size)
 
     def check_place(self, name: str, value: Any, size: int) -> list[float]:
         """A place that a row gives, if it is one."""
@@ -75,7 +75,7 @@ class Values:
                 default: int | None = None) -> int:  # fmt: skip
         """A whole number from `least` to `most`, both included."""
         value = self(name, sample, default)
-        if self.given and (type(value) is not int or value < least or (most is not None and value > most)):
+        if self.specified and (type(value) is not int or value < least or (most is not None and value > most)):
             limit = f"at least {least}" if most is None else f"{least} to {most}"
             raise self.error(name, f"is {brief(value)}; expected a whole number, {limit}")
         return value
@@ -97,7 +97,7 @@ class Values:
     def indices(self, name: str, sample: Callable[[], list[int]], count: int, distinct: bool = True) -> list[int]:
         """Indices into a list of `count` entries."""
         value = self(name, sample)
-        if self.given:
+        if self.specified:
             valid = isinstance(value, list) and all(type(v) is int and 0 <= v < count for v in value)
             if not valid or (distinct and len(set(value)) < len(value)):
                 once = ", each once" if distinct else ""
@@ -196,7 +196,7 @@ class Values:
             name: path of its place.
             xy: centre [2]. half: half its side. yaw: radians.
         """
-        if not self.given:
+        if not self.specified:
             return
         box = Box2D.square(np.asarray(xy, float)[:2], half - OVERLAP, yaw)
         for other, occupied in self._occupied:

@@ -56,7 +56,7 @@ class BinFill(Task):
             raise values.error("objects.target_numbers", f"is {numbers}; expected three numbers: red, blue, green")
         self.goal = Counter(dict(zip(COLOURS, numbers, strict=True)))
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
-        for colour, (x, y, yaw) in self._given_cubes() if values.given else self._draw_cubes(draws):
+        for colour, (x, y, yaw) in self._specified_cubes() if values.specified else self._draw_cubes(draws):
             cubes = self.cubes[colour]
             values.occupy("layout.slots", (x, y), H, yaw)
             cubes.append(self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, (x, y), yaw)))
@@ -65,11 +65,11 @@ class BinFill(Task):
                 problem = f"a {colour} cube for the bin"
                 raise (
                     values.error("objects.slot_assignment", f"lacks {problem}")
-                    if values.given
+                    if values.specified
                     else SceneError(f"BinFill, seed {self.seed}: {problem} finds no place.")
                 )
 
-    def _given_cubes(self) -> Iterator[tuple[str, list[float]]]:
+    def _specified_cubes(self) -> Iterator[tuple[str, list[float]]]:
         """Colour and place of each cube of the row."""
         names: Any = self.values("objects.slot_assignment", list)
         count = self.values.count("layout.slots")

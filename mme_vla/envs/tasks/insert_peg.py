@@ -56,7 +56,7 @@ class InsertPeg(Task):
         self.box = self.add(build_aperture_box(self, (0, 0), math.pi / 2))
         self.pegs = [
             self.add(build_peg(self, f"peg_{i}", PEG_LENGTH, PEG_RADIUS, head, tail, (0.2, 0.2 * (i - 1)), 0))
-            for i in range(self.values.count("initializations.pegs") if self.values.given else PEGS)
+            for i in range(self.values.count("initializations.pegs") if self.values.specified else PEGS)
         ]
         if not self.pegs:
             raise self.values.error("initializations.pegs", "is missing or empty")
@@ -82,7 +82,7 @@ class InsertPeg(Task):
         """Place and yaw of each peg of the row; empty where there is none."""
         values = self.values
         pegs: list[tuple[list[float], float]] = []
-        for i in range(len(self.pegs) if values.given else 0):
+        for i in range(len(self.pegs) if values.specified else 0):
             entry, name = values.find("initializations.pegs")[i], f"initializations.pegs.{i}"
             if not isinstance(entry, list) or len(entry) != 2:
                 raise values.error(name, f"is {entry!r}; expected [[x, y], yaw]")

@@ -64,7 +64,7 @@ class MoveCube(Task):
 
     def _place_peg(self, draws: Draws, part: str) -> tuple[float, float, float]:
         """Place and yaw of the peg in the video or in the execution."""
-        if not self.values.given:
+        if not self.values.specified:
             x, y, yaw = self._draw_peg(draws)
             self.values.note(f"layout.{part}.peg_offsets", [0.0, x, y])
             self.values.note(f"layout.{part}.peg_yaw", yaw)
@@ -81,7 +81,7 @@ class MoveCube(Task):
 
         name = f"layout.{part}.cube_pose"
         x, y, yaw = self.values.place(name, sample, size=3)
-        if self.values.given and math.dist((x, y), goal) <= H:
+        if self.values.specified and math.dist((x, y), goal) <= H:
             raise self.values.error(name, f"overlaps spec.layout.{part}.goal_xy")
         return (x, y), yaw
 

@@ -40,7 +40,7 @@ class PickHighlight(Task):
         self._add_cubes(draws, "distractor", "layout.distractors", self.turned("distractors"))
 
     def _add_cubes(self, draws: Draws, name: str, part: str, count: int) -> None:
-        for i in range(self.values.count(part) if self.values.given else count):
+        for i in range(self.values.count(part) if self.values.specified else count):
             colour, value = self._colour(draws, len(self.cubes)), f"{part}.{i}"
             avoid = [self.button, *self.cubes]
             self.cubes.append(add_cube(self, draws, f"{name}_{i}", colour, TABLE, avoid, gap=2 * H, value=value))
@@ -74,8 +74,8 @@ class PickHighlight(Task):
         return self.progress.index > 0 and any_picked_up(self, others)
 
     def success(self) -> bool:
-        every_one = len(self.picked) == len(self.goal_cubes)
-        return every_one and (self.progress.succeeded or not self.tier)
+        all_picked = len(self.picked) == len(self.goal_cubes)
+        return all_picked and (self.progress.succeeded or not self.tier)
 
     def subtasks(self) -> list[SubTask]:
         steps = [press(self.button, "press the button", "a")]

@@ -27,14 +27,15 @@ class VideoPlaceOrder(VideoPlace):
             return draws.permutation(4)[:count]
 
         rows = max(values.count("objects.visit_ids_by_object"), 1)
-        if rows != len(self.shown):
-            raise values.error("objects.visit_ids_by_object", f"has {rows} lists for {len(self.shown)} cubes")
+        if rows != len(self.demonstrated):
+            raise values.error("objects.visit_ids_by_object", f"has {rows} lists for {len(self.demonstrated)} cubes")
         visits = [values.indices(f"objects.visit_ids_by_object.{i}", sample, targets) for i in range(rows)]
         requested = values.integer("objects.answer_demo_index", lambda: 0, most=rows - 1)
         total = sum(map(len, visits))
-        self.cube = self.cubes[self.shown[requested]]
+        self.cube = self.cubes[self.demonstrated[requested]]
         self._visits = [
-            (self.cubes[cube], [self.targets[i] for i in ids]) for cube, ids in zip(self.shown, visits, strict=True)
+            (self.cubes[cube], [self.targets[i] for i in ids])
+            for cube, ids in zip(self.demonstrated, visits, strict=True)
         ]
         self.visited = self._visits[requested][1]
         count = len(self.visited)

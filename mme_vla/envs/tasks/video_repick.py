@@ -62,7 +62,7 @@ class VideoRepick(Task):
     def build(self, draws: Draws) -> None:
         self.button = add_button(self, draws, (-0.2, 0), (0.1, 0.1))
         self.cubes: list[Cube] = []
-        target, initiators = self._draw_cubes(draws) if not self.values.given else self._read_cubes(draws)
+        target, initiators = self._draw_cubes(draws) if not self.values.specified else self._read_cubes(draws)
         count = len(self.cubes)
         self.cube = self.cubes[self.values.integer("objects.target", lambda: target, most=count - 1)]
         self.pairs = self.values.pairs("actions.swap_pairs", count)
@@ -106,7 +106,7 @@ class VideoRepick(Task):
 
     def _add_cube(self, draws: Draws, colour: str | RGB, region: Region) -> None:
         i, avoid = len(self.cubes), [self.button, *self.cubes]
-        if not self.values.given:
+        if not self.values.specified:
             self.values.note(f"objects.colors.{i}", colour)
         self.cubes.append(add_cube(self, draws, f"cube_{i}", colour, region, avoid, value=f"layout.cubes.{i}"))
 
@@ -132,8 +132,8 @@ class VideoRepick(Task):
         return [under(self.cube), *tally(row(self.repetitions), left)]
 
     def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        shown = choices_made(ended, "a", video=True) | choices_made(ended, "b", video=False)
-        return shown | active_motions(self.swaps)
+        ended_choices = choices_made(ended, "a", video=True) | choices_made(ended, "b", video=False)
+        return ended_choices | active_motions(self.swaps)
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules belong to the stages."""

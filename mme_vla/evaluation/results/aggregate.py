@@ -77,7 +77,7 @@ def task_interval(outcomes: Outcomes, confidence: float = 0.95) -> Interval:
 def bootstrap(
     tasks: Mapping[str, Sequence[np.ndarray]], confidence: float = 0.95, samples: int = 10_000, seed: int = 0
 ) -> Interval:
-    """Percentile interval of a mean over tasks, drawing episodes anew within each task, and trainings anew for all.
+    """Percentile interval of a mean over tasks, resampling episodes within each task, and trainings for all.
 
     tasks: see `resampled_means`. The figure of several methods is the sum of theirs.
     """
@@ -92,15 +92,15 @@ def percentiles(values: np.ndarray, confidence: float = 0.95) -> Interval:
 
 
 def resampled_means(tasks: Mapping[str, Sequence[np.ndarray]], samples: int, seed: int) -> np.ndarray:
-    """Means over tasks of each method [methods, samples], of episodes drawn within each task, and of drawn trainings.
+    """Means over tasks of each method [methods, samples], of episodes sampled within each task, and of trainings.
 
     tasks: for each task one array of [episodes, trainings] a method, already averaged over the runs of a training: an
-    episode is drawn with all of them, for all methods alike. Of one training none is drawn.
+    episode is sampled with all of them, for all methods alike. Of one training none is sampled.
     """
     rng = np.random.default_rng(seed)
     counts = [values.shape[1] for values in next(iter(tasks.values()))]
     one = rng if max(counts) == 1 else np.random.default_rng([seed, 1])
-    # How often each training is drawn, as shares: [samples, trainings] a method.
+    # How often each training is sampled, as shares: [samples, trainings] a method.
     shares = [one.multinomial(n, np.full(n, 1 / n), samples) / n if n > 1 else np.ones((samples, 1)) for n in counts]
     means = np.zeros((len(counts), samples))
     for of_methods in tasks.values():
@@ -109,23 +109,6 @@ def resampled_means(tasks: Mapping[str, Sequence[np.ndarray]], samples: int, see
         for method, (values, share) in enumerate(zip(of_methods, shares, strict=True)):
             means[method] += sum(values[:, i][sampled].mean(1) * share[:, i] for i in range(values.shape[1]))
     return means / len(tasks)
-
-
-def sign_test(first: int, second: int) -> float:
-    """Exact two-sided p that as many of the differing pairs favour one side; on pairs of runs, McNemar's test."""
-    n = first + second
-    tail = sum(math.comb(n, k) for k in range(min(first, second) + 1))
-    return min(1.0, 2 * tail / 2**n)
-
-
-def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's correction for several comparisons, in the order given."""
-    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
-    corrected, highest = [0.0] * len(p_values), 0.0
-    for rank, i in enumerate(order):
-        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[i]))
-        corrected[i] = highest
-    return corrected
 
 
 DEFAULT_BUDGET = 512

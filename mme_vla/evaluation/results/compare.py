@@ -1,5 +1,6 @@
 """Two policies on the same episodes: how much better, and could it be chance."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -7,8 +8,25 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey
-from mme_vla.evaluation.results.aggregate import Interval, Method, bootstrap, holm, sign_test
+from mme_vla.evaluation.results.aggregate import Interval, Method, bootstrap
 from mme_vla.evaluation.results.scopes import Protocol, scopes
+
+
+def sign_test(first: int, second: int) -> float:
+    """Exact two-sided p that as many of the differing pairs favour one side; on pairs of runs, McNemar's test."""
+    n = first + second
+    tail = sum(math.comb(n, k) for k in range(min(first, second) + 1))
+    return min(1.0, 2 * tail / 2**n)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Holm's correction for several comparisons, in the order given."""
+    order = sorted(range(len(p_values)), key=lambda i: p_values[i])
+    corrected, highest = [0.0] * len(p_values), 0.0
+    for rank, i in enumerate(order):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[i]))
+        corrected[i] = highest
+    return corrected
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
-from mme_vla.evaluation.results.aggregate import Method, Results, sign_test
-from mme_vla.evaluation.results.compare import show_p
+from mme_vla.evaluation.results.aggregate import Method, Results
+from mme_vla.evaluation.results.compare import show_p, sign_test
 from mme_vla.evaluation.results.curves import Curves, Place, curves_of
 from mme_vla.evaluation.results.tables import Table
 from mme_vla.evaluation.rollout.events import split_words
@@ -23,8 +23,8 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
         names = ("model", "subgoal", "memory_budget", "composition", "recipe", "data")
         return tuple(getattr(method, name) for name in names)
 
-    plain = {identity(method): method for method in results.methods if method.event is None}
-    return [(m, plain[identity(m)]) for m in results.methods if m.event is not None and identity(m) in plain]
+    baseline = {identity(method): method for method in results.methods if method.event is None}
+    return [(m, baseline[identity(m)]) for m in results.methods if m.event is not None and identity(m) in baseline]
 
 
 def matched_pairs(records: Sequence[EpisodeRecord]) -> dict[RunKey, list[Pair]]:
@@ -35,9 +35,9 @@ def matched_pairs(records: Sequence[EpisodeRecord]) -> dict[RunKey, list[Pair]]:
     there: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {(r.run, r.key): r for r in records if r.outcome != "error"}
     pairs: dict[RunKey, list[Pair]] = {}
     for (run, key), record in there.items():
-        plain = there.get((run._replace(event=None), key))
-        if run.event is not None and plain is not None:
-            pairs.setdefault(run, []).append((record, plain))
+        baseline = there.get((run._replace(event=None), key))
+        if run.event is not None and baseline is not None:
+            pairs.setdefault(run, []).append((record, baseline))
     return pairs
 
 
@@ -62,12 +62,12 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
 
 
 def _counts(pairs: Sequence[Pair]) -> list[str]:
-    kept = sum(record.success and plain.success for record, plain in pairs)
-    lost = sum(plain.success and not record.success for record, plain in pairs)
-    gained = sum(record.success and not plain.success for record, plain in pairs)
-    rates = [f"{100 * count / len(pairs):.1f}" for count in (kept + lost, kept + gained)]
+    retained = sum(record.success and baseline.success for record, baseline in pairs)
+    lost = sum(baseline.success and not record.success for record, baseline in pairs)
+    gained = sum(record.success and not baseline.success for record, baseline in pairs)
+    rates = [f"{100 * count / len(pairs):.1f}" for count in (retained + lost, retained + gained)]
     idle = sum(bool(did_not_act(record)) for record, _ in pairs)
-    return [str(len(pairs)), *rates, str(kept), str(lost), str(gained), show_p(sign_test(lost, gained)), str(idle)]
+    return [str(len(pairs)), *rates, str(retained), str(lost), str(gained), show_p(sign_test(lost, gained)), str(idle)]
 
 
 def event_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:

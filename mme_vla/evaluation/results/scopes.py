@@ -17,7 +17,7 @@ GROUPS = (
     "Dynamic Online Scene-Change",
     "Event-Salient",
 )
-OWN = "Own tasks"  # Suite and group of the tasks that are not RoboMME's: a user's own
+USER_SUITE = "Own tasks"  # Suite and group of the tasks that are not RoboMME's: a user's own
 TEST_EPISODES = 50  # Episodes a task has in the test split; the paper runs all of them
 MAX_STEPS = 1300  # Steps an episode may take in the paper's experiments
 PAPER_SEEDS = (7, 42, 0)  # Model seeds, in the order of the leaderboard's columns
@@ -74,7 +74,7 @@ PAPER_ORDER = (
 
 def task_facts(name: str) -> Task:
     """Look a task up; what RoboMME does not have is a user's own."""
-    return TASK_FACTS.get(name) or Task(name, OWN, (), OWN, False, 0)
+    return TASK_FACTS.get(name) or Task(name, USER_SUITE, (), USER_SUITE, False, 0)
 
 
 @dataclass(frozen=True)
@@ -116,15 +116,17 @@ class Protocol:
 
     @property
     def suites(self) -> list[str]:
-        """The suites that take part: RoboMME's, those of other environments, `OWN` last."""
+        """The suites that take part: RoboMME's, those of other environments, `USER_SUITE` last."""
         return [
-            suite for suite in (*SUITES, *dict.fromkeys(self.task_suites.values()), OWN) if self.choose("suite", suite)
+            suite
+            for suite in (*SUITES, *dict.fromkeys(self.task_suites.values()), USER_SUITE)
+            if self.choose("suite", suite)
         ]
 
     def facts(self, task: str) -> Task:
         """What is known of a task; of an environment's own it is the suite."""
         facts = task_facts(task)
-        return facts if task in TASK_FACTS else facts._replace(suite=self.task_suites.get(task, OWN))
+        return facts if task in TASK_FACTS else facts._replace(suite=self.task_suites.get(task, USER_SUITE))
 
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""
@@ -139,8 +141,8 @@ def suites_of(records: Iterable[EpisodeRecord]) -> dict[str, str]:
 def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
     """The tasks that a run consists of by default: the benchmark's, if a record is of one, and the user's own."""
     names = {record.task for record in records}
-    own = tuple(sorted(names - TASK_FACTS.keys()))
-    return (*PAPER_ORDER, *own) if names & TASK_FACTS.keys() or not own else own
+    user_tasks = tuple(sorted(names - TASK_FACTS.keys()))
+    return (*PAPER_ORDER, *user_tasks) if names & TASK_FACTS.keys() or not user_tasks else user_tasks
 
 
 class Scope(NamedTuple):

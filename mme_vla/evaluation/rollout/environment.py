@@ -166,7 +166,7 @@ class ChunkEnv:
         self._returned = frames.leave(draw, self._returned)
         report = self._report(info) | {"executed": executed, "steps": n_frames}
         if "hold" in command:
-            report["held"] = self._held()
+            report["held"] = self._hold_action()
         if terminated or truncated:
             report |= self._finish_video(report)
         return frames.observation(), total_reward, terminated, truncated, report
@@ -184,7 +184,7 @@ class ChunkEnv:
         self._last = action
         return benchmark_action(self._robot.action, action, self._stick, self._pose)
 
-    def _held(self) -> np.ndarray | None:
+    def _hold_action(self) -> np.ndarray | None:
         """The policy's action that keeps the robot where it is."""
         if hasattr(self._env, "hold_action"):
             return np.asarray(self._env.hold_action, np.float32)

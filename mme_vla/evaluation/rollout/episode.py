@@ -49,7 +49,7 @@ class RunningEpisode:
         self.job, self.trace = job, trace
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
         self.events = EventCourse(events)
-        self._shown = np.zeros(0, np.int64)  # The environment's frames that the policy observes
+        self._visible = np.zeros(0, np.int64)  # The environment's frames that the policy observes
         self._simulated = 0  # Frames of the environment
         self.watched: Any = None  # What the subgoal predictor knows of the episode
         self.worker = -1
@@ -90,7 +90,7 @@ class RunningEpisode:
         self._offer(info)
         count, length = self._count(info), len(frames["state"])
         if self.events.holding is not None:
-            self.events.held += length
+            self.events.hold_steps += length
             n_frames = min(self.events.holding.observed, length)
             frames = self._observed(frames, length, np.arange(length - n_frames, length))
             self._expect(frames, np.zeros(n_frames, bool), self._holding_actions(n_frames, info.get("held")), info)
@@ -106,7 +106,7 @@ class RunningEpisode:
     @property
     def unobserved(self) -> int:
         """Frames of the environment that events withheld so far; below 0 where they repeated some."""
-        return self._simulated - len(self._shown)
+        return self._simulated - len(self._visible)
 
     def _offer(self, info: dict[str, Any]) -> None:
         """Let the episode choose among the options of now: which of them are possible may change."""
@@ -195,18 +195,18 @@ class RunningEpisode:
         """Those of the environment's next frames that the policy observes; by default all."""
         every = np.arange(length)
         numbers = every if numbers is None else numbers
-        self._shown = np.concatenate([self._shown, self._simulated + numbers])
+        self._visible = np.concatenate([self._visible, self._simulated + numbers])
         self._simulated += length
         if np.array_equal(numbers, every):
             return frames
         lists = {name: [images[i] for i in numbers] for name, images in frames.items() if name != "state"}
         return {**lists, "state": frames["state"][numbers]}
 
-    def _holding_actions(self, n_frames: int, held: np.ndarray | None) -> np.ndarray | None:
+    def _holding_actions(self, n_frames: int, action: np.ndarray | None) -> np.ndarray | None:
         """The actions that led to frames at which the robot held its pose; None before the first action."""
         if self._robot.action.frames is None:
             return self._sent[:0]
-        return None if held is None else np.repeat(np.asarray(held, np.float32)[None], n_frames, 0)
+        return None if action is None else np.repeat(np.asarray(action, np.float32)[None], n_frames, 0)
 
     def _count(self, info: dict[str, Any]) -> int:
         count = int(info.get("executed", 0))
@@ -220,5 +220,5 @@ class RunningEpisode:
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need one frame an action."
             )
         self._frames, self._demo, self._led, self._info, self._at = frames, demo, led, info, 0
-        began = np.searchsorted(self._shown, info.get("began", ()))  # as numbers of observed frames
+        began = np.searchsorted(self._visible, info.get("began", ()))  # as numbers of observed frames
         self.episode.begun(began.tolist(), self.video_frames)

@@ -108,13 +108,13 @@ def evaluate_events(
     for placed in (placed for event in events for placed in read_events(event)):
         placed.event.check(policy)
     arms = [replace(settings, event=event) for event in events]
-    plain = evaluate(policy, jobs, output, facts, settings, **how)
+    matched = evaluate(policy, jobs, output, facts, settings, **how)
     records: list[EpisodeRecord] = []
     for arm in arms:
         named, folder = replace(facts, event=arm.event), output / folder_of(str(arm.event))
         run = evaluate(policy, jobs, folder, named, arm, **{**how, "times_from": how.get("times_from") or output})
         records += run.records
-    return Evaluation(records, run.workload, plain.records) if arms else plain
+    return Evaluation(records, run.workload, matched.records) if arms else matched
 
 
 def evaluate(

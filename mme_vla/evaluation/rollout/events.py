@@ -37,7 +37,7 @@ class Event:
 
     @property
     def hold(self) -> int:
-        """Control steps for which the robot holds its pose and the scene goes on; the step limit grows by as many."""
+        """Control steps for which the robot holds its pose and the scene continues; the step limit grows by as many."""
         return 0
 
     @property
@@ -195,13 +195,13 @@ class EventCourse:
     """The events of one running episode.
 
     log: of each its text as `event`, and as `step` the control step at which it acted; None while it has not.
-    held: control steps for which events held the robot. holding: the event whose frames come next.
+    hold_steps: control steps for which events held the robot. holding: the event whose frames come next.
     """
 
     def __init__(self, events: Sequence[PlacedEvent]) -> None:
         self._events = events
         self.log: list[dict[str, Any]] = [{"event": placed.text, "step": None} for placed in events]
-        self.held = 0
+        self.hold_steps = 0
         self.holding: Event | None = None
 
     def video(self, length: int) -> np.ndarray:
@@ -225,8 +225,8 @@ class EventCourse:
                 continue
             if placed.unit == "subtask" and not subtask:
                 raise UserError(f"event={placed.text}: this environment tells no sub-tasks; place it by @step:<n>.")
-            if placed.reached(step - self.held, subtask):
-                entry["step"] = step - self.held
+            if placed.reached(step - self.hold_steps, subtask):
+                entry["step"] = step - self.hold_steps
                 placed.event.act(episode)
                 if placed.event.hold:
                     self.holding = placed.event

@@ -36,7 +36,7 @@ class RenderPlan:
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
         events = [placed.event for placed in read_events(settings.event)]
-        self._held = sum(event.hold for event in events)
+        self._hold_steps = sum(event.hold for event in events)
         self._resampled = any(not event.placed for event in events)
         memory = policy.memory
         every = past_view_spec(memory) is not None
@@ -91,7 +91,7 @@ class RenderPlan:
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
         # A motion, or an event that holds the robot, takes any number of frames: the policy may act at each.
-        action, most = self._robot.action, self._settings.max_steps + self._held + 2
-        anywhere = action.frames is None or self._held
+        action, most = self._robot.action, self._settings.max_steps + self._hold_steps + 2
+        anywhere = action.frames is None or self._hold_steps
         apart = 1 if anywhere else min(self._settings.execute or action.execute, action.horizon)
         return frames_read(self._policy, exec_start + np.arange(0, most, apart), exec_start)

@@ -11,7 +11,7 @@ import numpy as np
 from mme_vla.errors import check_sizes
 from mme_vla.memory.base import PerceptualMemory
 from mme_vla.memory.extensions.attending import FrameMemory
-from mme_vla.memory.framesamp import whole_frames
+from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -39,11 +39,11 @@ class Anchors(FrameMemory, PerceptualMemory):
             spacing: frames between two of the last ones, of which the current frame is one.
         """
         check_sizes("memory", spacing=spacing)
-        frames = whole_frames(budget, grid, at_least=2)
+        frames = budget_frames(budget, grid, at_least=2)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
         self.recent, self.spacing = frames - 1, spacing
 
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """Frame 0 and the last ones, ascending."""
         last = step - self.spacing * np.arange(self.recent)
         return np.union1d([0], last[last > 0])

@@ -65,14 +65,14 @@ class FrameMemory(MemoryModule):
     """A subclass says which frames; all tokens of these are selected, and as many as there are."""
 
     @abstractmethod
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames that are read at `step` of an episode whose execution begins at `exec_start`; int64, ascending."""
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.chosen(int(step), exec_start) for step in steps])
+        return union_frames([self.selected_frames(int(step), exec_start) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return all_patches(self.chosen(step, history.exec_start), self.storage.grid)
+        return all_patches(self.selected_frames(step, history.exec_start), self.storage.grid)
 
     def padded_length(self, count: int) -> int:
         return count if self.pad_left else self.capacity

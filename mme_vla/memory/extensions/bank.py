@@ -69,7 +69,7 @@ class Banked(FrameMemory):
         self.reduce, self.output = nn.Linear(d_vision, hidden), nn.Linear(hidden, width)
         self.bank = MemoryBank(hidden, length, retrieval_layers, time_code, fusion, consolidation)
 
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The moments at `step`, the last of them `step` itself."""
         return recurrent_frames(step, exec_start, self.moments, self.video, self.stride)
 

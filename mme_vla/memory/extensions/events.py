@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, ProprioMemory, ScoringMemory, all_patches
-from mme_vla.memory.framesamp import whole_frames
+from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.tokendrop import ChangeScorer
 from mme_vla.registry import MEMORIES
@@ -54,7 +54,7 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
         """
         check_sizes("memory", stride=stride)
         require(gripper > 0, f"memory.gripper={gripper}: must be greater than 0.")
-        frames = whole_frames(budget, grid, at_least=2)
+        frames = budget_frames(budget, grid, at_least=2)
         storage = StorageSpec(grid, pooling, stride, ChangeScorer(grid, stride).key)
         super().__init__(d_vision, width, budget, storage, **encoder)
         self.frames, self.gripper, self.gripper_state = frames, gripper, gripper_state
@@ -68,10 +68,10 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         frames = self.storage.stored_frames(step + 1)
         if len(frames) > self.frames:
-            frames = frames[self.kept(history, frames)]
+            frames = frames[self.top_frames(history, frames)]
         return all_patches(frames, self.storage.grid)
 
-    def kept(self, history: History, frames: np.ndarray) -> np.ndarray:
+    def top_frames(self, history: History, frames: np.ndarray) -> np.ndarray:
         """Which of the stored frames [n] up to now are kept: ascending indices, no more than fit."""
         states = history.proprio(frames).numpy().astype(np.float64)
         arm, gripper = np.delete(states, self.gripper_state, 1), states[:, self.gripper_state]

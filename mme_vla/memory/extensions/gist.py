@@ -79,7 +79,7 @@ class Gist(FrameMemory):
         self.layers = nn.ModuleList(ReadingBlock(hidden, heads) for _ in range(layers))
         self.norm, self.output = nn.LayerNorm(hidden), nn.Linear(hidden, width)
 
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames read at `step`, ascending, the first frame and `step` among them."""
         everything = recurrent_frames(step, exec_start, step + 2, step + 2, self.stride)
         frames = np.union1d([0], everything)

@@ -18,7 +18,7 @@ from torch.nn import functional
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.extensions.attending import by_frame, rows_at
-from mme_vla.memory.framesamp import evenly_spaced_frames, whole_frames
+from mme_vla.memory.framesamp import budget_frames, evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import default_hidden, full_precision, linear
 from mme_vla.registry import MEMORIES
@@ -55,7 +55,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
             hidden: width of the head; None is a quarter of `d_vision`, at least 64.
         """
         check_sizes("memory", every=every, pool=pool)
-        frames = whole_frames(budget, grid, at_least=3)
+        frames = budget_frames(budget, grid, at_least=3)
         require(
             frames <= pool, f"memory.pool={pool}: the frames of memory.budget={budget} are {frames}, so at least that."
         )
@@ -64,29 +64,29 @@ class Keyframes(PerceptualMemory, ReadsLabels):
         self.frames, self.pool, self.capacity = frames, pool, pool * grid**2
         self.read, self.write = nn.Linear(2 * d_vision, hidden), nn.Linear(hidden, 1)
 
-    def chosen(self, step: int) -> np.ndarray:
+    def selected_frames(self, step: int) -> np.ndarray:
         """The frames that the head reads at `step`, ascending, the newest stored one among them."""
         stored = self.storage.stored_frames(step + 1)
         return stored[evenly_spaced_frames(len(stored) - 1, self.pool)]
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([self.chosen(int(step)) for step in steps])
+        return union_frames([self.selected_frames(int(step)) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """The candidates: `forward` keeps some of them."""
-        return all_patches(self.chosen(step), self.storage.grid)
+        return all_patches(self.selected_frames(step), self.storage.grid)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2
         valid = by_frame(history.mask, patches)[..., 0]
         scores = self.scores(history.features)
-        kept = self.kept(scores, valid)
-        tokens = (kept[..., None] * patches + torch.arange(patches, device=kept.device)).flatten(1)
+        top_frames = self.top_frames(scores, valid)
+        tokens = (top_frames[..., None] * patches + torch.arange(patches, device=top_frames.device)).flatten(1)
         features, positions, mask = (
             rows_at(part, tokens) for part in (history.features, history.positions, history.mask)
         )
         # One in the forward pass, the sigmoid in the backward pass.
-        worth = rows_at(scores, kept).sigmoid()
+        worth = rows_at(scores, top_frames).sigmoid()
         worth = (worth + (1 - worth).detach()).repeat_interleave(patches, 1)
         encoded = self.encoder(features, positions, mask)
         ages = None if history.ages is None else rows_at(history.ages, tokens)
@@ -102,7 +102,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
             change = torch.diff(means, dim=1, prepend=means[:, :1])
             return linear(self.write, functional.silu(linear(self.read, torch.cat([means, change], -1))))[..., 0]
 
-    def kept(self, scores: Tensor, valid: Tensor) -> Tensor:
+    def top_frames(self, scores: Tensor, valid: Tensor) -> Tensor:
         """Which frames are kept: int64 [b, frames], ascending, padding last.
 
         Highest scores first, those lower than a neighbour's after all others. The first frame and the newest in any

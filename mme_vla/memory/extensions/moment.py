@@ -71,7 +71,7 @@ class Moment(FrameMemory):
         self.layers = nn.ModuleList(ReadingBlock(hidden, heads) for _ in range(layers))
         self.norm, self.output = nn.LayerNorm(hidden), nn.Linear(hidden, width)
 
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames read at `step`, the last of them `step`."""
         return recurrent_frames(step, exec_start, self.steps, max(5 * self.steps // 8, 1), self.stride)
 

@@ -16,7 +16,7 @@ import numpy as np
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory
 from mme_vla.memory.extensions.attending import FrameMemory
-from mme_vla.memory.framesamp import whole_frames
+from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -49,12 +49,12 @@ class Pyramid(FrameMemory, PerceptualMemory):
             len(strides) > 0 and all(a < b and b % a == 0 for a, b in pairwise(strides)),
             f"memory.strides={strides}: each must be a multiple of the one before it, and greater, as in [2, 8, 32].",
         )
-        frames = whole_frames(budget, grid, at_least=len(strides) + 1)
+        frames = budget_frames(budget, grid, at_least=len(strides) + 1)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, strides[0]), **encoder)
         self.strides = strides
         self.sizes = [len(part) for part in np.array_split(np.arange(frames - 1), len(strides))]
 
-    def chosen(self, step: int, exec_start: int) -> np.ndarray:
+    def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames kept at `step`, ascending: frame 0, and k·stride − 1 within the window of each stride."""
         windows, newest = [np.zeros(1, np.int64)], step
         for stride, size in zip(self.strides, self.sizes, strict=True):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches
-from mme_vla.memory.framesamp import evenly_spaced_frames, whole_frames
+from mme_vla.memory.framesamp import budget_frames, evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 
@@ -46,7 +46,7 @@ class Retrieval(PerceptualMemory):
             cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1 never cuts.
             longest: most stored frames of a chunk.
         """
-        frames = whole_frames(budget, grid)
+        frames = budget_frames(budget, grid)
         require(-1 <= cut <= 1, f"memory.cut={cut} is a cosine: it lies between -1 (never cut) and 1 (cut everywhere).")
         check_sizes("memory", longest=longest)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)

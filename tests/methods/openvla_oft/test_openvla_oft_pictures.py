@@ -12,7 +12,7 @@ from helpers.baselines import baselines_folder
 from helpers.golden import error
 from helpers.openvla_golden import case
 from mme_vla import UserError
-from mme_vla.methods.openvla_oft import processor as pictures
+from mme_vla.methods.openvla_oft import processor as image_ops
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles
 from mme_vla.methods.prismatic import HALF, OPENVLA
 from mme_vla.processing.images import to_unit_range
@@ -36,9 +36,9 @@ def same_levels(actual: Tensor, golden: Tensor) -> None:
 
 def test_openvla_oft_resize_and_centre_crop(folder: Path) -> None:
     golden, about = case(folder, "pictures")
-    resized = torch.from_numpy(pictures.lanczos(golden["raw"].numpy(), about["size"]))
+    resized = torch.from_numpy(image_ops.lanczos(golden["raw"].numpy(), about["size"]))
     same_levels(resized, golden["resized"])
-    same_levels(pictures.centre_crop(channels_first(golden["resized"]))[0].permute(1, 2, 0), golden["center_crop"])
+    same_levels(image_ops.centre_crop(channels_first(golden["resized"]))[0].permute(1, 2, 0), golden["center_crop"])
 
 
 def test_openvla_oft_resize_after_jpeg_is_near_the_originals(folder: Path) -> None:
@@ -47,9 +47,9 @@ def test_openvla_oft_resize_after_jpeg_is_near_the_originals(folder: Path) -> No
     raw, expected = golden["raw"].numpy(), golden["resized_after_jpeg"].numpy().astype(int)
 
     def off(frames: np.ndarray) -> float:
-        return float(np.abs(pictures.lanczos(frames, about["size"]).astype(int) - expected).mean())
+        return float(np.abs(image_ops.lanczos(frames, about["size"]).astype(int) - expected).mean())
 
-    assert off(pictures.jpeg_round_trip(raw)) <= min(2.0, 0.8 * off(raw))
+    assert off(image_ops.jpeg_round_trip(raw)) <= min(2.0, 0.8 * off(raw))
 
 
 def test_openvla_oft_augmentation_step_by_step(folder: Path) -> None:
@@ -59,16 +59,16 @@ def test_openvla_oft_augmentation_step_by_step(folder: Path) -> None:
     start = channels_first(golden["resized"])
     for kind in kinds:
         draws = golden[f"{kind}/draws"][None]
-        pixels = pictures.crop(start.float() / 255, draws[:, 0], draws[:, 1]).clamp(0, 1)
+        pixels = image_ops.crop(start.float() / 255, draws[:, 0], draws[:, 1]).clamp(0, 1)
         assert error(pixels, channels_first(golden[f"{kind}/crop"])) <= FLOAT
         steps = {
-            "brightness": pictures.brighten, "contrast": pictures.contrast, "saturation": pictures.saturate,
-            "hue": pictures.shift_hue,
+            "brightness": image_ops.brighten, "contrast": image_ops.contrast, "saturation": image_ops.saturate,
+            "hue": image_ops.shift_hue,
         }  # fmt: skip
         for by, (name, change) in zip(draws[0, 2:], steps.items(), strict=True):
             pixels = change(pixels, by.float().view(1, 1, 1, 1)).clamp(0, 1)
             assert error(pixels, channels_first(golden[f"{kind}/{name}"])) <= FLOAT, name
-        same_levels(pictures.augment(start, draws)[0].permute(1, 2, 0), golden[f"{kind}/final"])
+        same_levels(image_ops.augment(start, draws)[0].permute(1, 2, 0), golden[f"{kind}/final"])
 
 
 def test_openvla_oft_six_channels(folder: Path) -> None:

@@ -40,7 +40,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-class Plain:
+class Identity:
     """Hands samples on as they are."""
 
     def item(self, sample: KeyframeSample) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def source_of(folder: Path) -> EpisodeSource:
 
 def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> None:
     source = source_of(folder)
-    data = KeyframeDataset([source], Plain(), 1, sampled=False)
+    data = KeyframeDataset([source], Identity(), 1, sampled=False)
     chains = [chain for e in range(len(LENGTHS)) for chain in EpisodeKeyframes(file_of(source.root, e)).chains]
     assert len(data) == sum(map(len, chains))
     assert data.total_frames == sum(LENGTHS)
@@ -118,7 +118,7 @@ def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> 
 
 
 def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(folder: Path) -> None:
-    data, again = (KeyframeDataset([source_of(folder)], Plain(), 3, seed=5, sampled=False) for _ in range(2))
+    data, again = (KeyframeDataset([source_of(folder)], Identity(), 3, seed=5, sampled=False) for _ in range(2))
     begins: dict[int, set[int]] = {}
     for epoch in range(12):
         data.set_epoch(epoch)
@@ -148,7 +148,7 @@ class ManyTasks:
         return self.tasks[episode]
 
 
-def drawn_shares(
+def sampled_shares(
     episodes: dict[str, list[list[int]]], length: int, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[dict[str, float], dict[tuple[int, int], float]]:
     """How often tasks, and places (episode, links of the chain) are drawn."""
@@ -160,7 +160,7 @@ def drawn_shares(
         return SimpleNamespace(chains=chains)
 
     monkeypatch.setattr(keyframes, "EpisodeKeyframes", keep)
-    data = KeyframeDataset([source], Plain(), length)
+    data = KeyframeDataset([source], Identity(), length)
     counts: Counter[str] = Counter()
     places: Counter[tuple[int, int]] = Counter()
     for epoch in range(-(-6000 // len(data))):
@@ -174,7 +174,7 @@ def drawn_shares(
 
 
 def test_the_first_stage_draws_a_task_and_then_one_of_its_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
-    shares, places = drawn_shares({"few": [[2]], "many": [[4, 4, 4], [8]]}, 1, monkeypatch)
+    shares, places = sampled_shares({"few": [[2]], "many": [[4, 4, 4], [8]]}, 1, monkeypatch)
     assert shares == pytest.approx({"few": 0.5, "many": 0.5}, abs=0.03)
     assert places[0, 0] == pytest.approx(0.25, abs=0.03) and places[2, 7] == pytest.approx(0.5 / 20, abs=0.01)
 
@@ -183,7 +183,7 @@ def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_sh
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of `half` every second draw is thrown away, and then a task is drawn anew: it is seen half as often."""
-    shares, places = drawn_shares({"half": [[5, 1]], "whole": [[5], [5, 5, 5]], "never": [[2]]}, 3, monkeypatch)
+    shares, places = sampled_shares({"half": [[5, 1]], "whole": [[5], [5, 5, 5]], "never": [[2]]}, 3, monkeypatch)
     assert shares == pytest.approx({"half": 1 / 3, "whole": 2 / 3}, abs=0.03)
     assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(1 / 3, abs=0.03)
 

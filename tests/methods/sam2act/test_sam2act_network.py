@@ -133,7 +133,7 @@ def test_adapters_reach_queries_and_values_alone(golden: dict[str, np.ndarray]) 
 # Network
 
 
-class Drawn:
+class Rendered:
     """The golden network: its sizes from the names' shapes, its weights and inputs drawn by rule."""
 
     def __init__(self) -> None:
@@ -196,8 +196,8 @@ class Drawn:
 
 
 @pytest.fixture(scope="module")
-def case() -> Drawn:
-    return Drawn()
+def case() -> Rendered:
+    return Rendered()
 
 
 @pytest.fixture(scope="module")
@@ -205,14 +205,14 @@ def expected() -> dict[str, np.ndarray]:
     return load("network")
 
 
-def test_every_golden_parameter_has_a_place_and_every_place_a_parameter(case: Drawn) -> None:
+def test_every_golden_parameter_has_a_place_and_every_place_a_parameter(case: Rendered) -> None:
     targets = [name for name in case.network.state_dict() if not name.startswith("encoder.")]
     sources = {piece.path for pieces in released_names(targets, case.stages).values() for piece in pieces}
     assert sources == set(case.shapes) - {RATES}
 
 
 @torch.no_grad()
-def test_the_coarse_view_follows_the_golden_stream(case: Drawn, expected: dict[str, np.ndarray]) -> None:
+def test_the_coarse_view_follows_the_golden_stream(case: Rendered, expected: dict[str, np.ndarray]) -> None:
     remembered, finder = case.network.memory.init_state(), PointFinder(case.sizes.side)
     steps = int(expected["coarse_steps"])
     for step in range(steps):
@@ -228,7 +228,7 @@ def test_the_coarse_view_follows_the_golden_stream(case: Drawn, expected: dict[s
 
 
 @torch.no_grad()
-def test_the_closer_view_rotates_and_grips_as_the_original(case: Drawn, expected: dict[str, np.ndarray]) -> None:
+def test_the_closer_view_rotates_and_grips_as_the_original(case: Rendered, expected: dict[str, np.ndarray]) -> None:
     logits, tokens = case.network.fine_step(case.encoded_views("fine", 1))
     assert relative_error(logits, expected["fine/trans"]) < NETWORK
     waypoint = PointFinder(case.sizes.side).find(logits)
@@ -242,7 +242,7 @@ def test_the_closer_view_rotates_and_grips_as_the_original(case: Drawn, expected
         assert relative_error(actual[axis][:, None], expected[f"fine/feat_{axis}"]) < NETWORK
 
 
-def test_a_sequence_of_keyframes_has_the_golden_loss_and_gradients(case: Drawn) -> None:
+def test_a_sequence_of_keyframes_has_the_golden_loss_and_gradients(case: Rendered) -> None:
     golden, norms = load("training"), meta()["training_grad_l2"]
     waypoints = torch.from_numpy(golden["waypoints"])[:, 0]
     case.network.zero_grad()

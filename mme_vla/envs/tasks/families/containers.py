@@ -41,7 +41,7 @@ def add_containers(
     half, gap = (0.2, 2 * H) if there is None else (WIDER, H)
     stop = len(containers) + count
     part = "layout.bins" if there is None else "layout.empty_bins"
-    if env.values.given:
+    if env.values.specified:
         stop = len(containers) + env.values.count(part)
     first = len(containers)
     while len(containers) < stop:
@@ -59,7 +59,7 @@ def add_container(
     env: Task, draws: Draws, value: str, region: Region, avoid: Sequence[Avoid], gap: float, name: str
 ) -> Container | None:
     """Add a container at the row's place, or at a random one; None where it finds none."""
-    if env.values.given:
+    if env.values.specified:
         place = env.values.place(value, list, size=3)
     else:
         sample = draw_container(draws, region, avoid, gap=gap, degrees=True)
@@ -195,7 +195,7 @@ class Unmask(Task):
     def build_containers(self, draws: Draws, avoid: Sequence[Avoid]) -> None:
         """Place the containers, hide the cubes under the first three, and add what a dial or a row adds."""
         self.containers = add_containers(self, draws, STANDING[self.difficulty], avoid)
-        if self.values.given:
+        if self.values.specified:
             check_count(self, len(self.containers))
         self.colours = sample_colours(self, draws, UNMASK_COLOURS)
         self.pick_count = self.values.integer(
@@ -255,7 +255,7 @@ class UnmaskSwap(Task):
             SceneError: a container finds no place.
         """
         self.containers: list[Container] = []
-        count = self.values.count("layout.bins") if self.values.given else len(anchors)
+        count = self.values.count("layout.bins") if self.values.specified else len(anchors)
         for i in range(count):
             region = Region(anchors[min(i, len(anchors) - 1)], ANCHOR_HALF)
             container = add_container(
@@ -284,7 +284,7 @@ class UnmaskSwap(Task):
         self.pairs = self.values.pairs("actions.swap_pairs", count)
         initiators = []
         if self.pairs is None:
-            sampled = [] if self.values.given else self._draw_initiators(draws, count)
+            sampled = [] if self.values.specified else self._draw_initiators(draws, count)
             initiators = self.values.indices("actions.swap_initiators", lambda: sampled, count, distinct=False)
         self.initiators = [self.containers[i] for i in initiators]
         swaps = initiators if self.pairs is None else self.pairs
@@ -315,7 +315,7 @@ class UnmaskSwap(Task):
         return list(zip(self.colours, self.over_cubes, strict=True))[: self.pick_count]
 
     def evidence(self, ended: Mapping[int, SubTask]) -> Collection[str]:
-        return active_motions(self.shown)
+        return active_motions(self.visible_motions)
 
     def start_episode(self, draws: Draws) -> None:
         inner, outer = self.containers, self.outer.containers
@@ -324,7 +324,7 @@ class UnmaskSwap(Task):
         nearest = [Swap(thing, inner, start + i * steps, steps=steps) for i, thing in enumerate(self.initiators)]
         swaps = nearest if self.pairs is None else planned_swaps(self.pairs, inner, start, steps)
         cover = Cover(inner, groups["inner"])
-        self.shown: list[Cover | Swap] = [cover, *swaps]
+        self.visible_motions: list[Cover | Swap] = [cover, *swaps]
         self.motions: list[Cover | Swap | Hide] = [
             cover,
             Cover(outer, groups["outer"]),

@@ -88,7 +88,7 @@ def check_colour(env: Task, colour: str | RGB) -> None:
 
 def cube_names(env: Task, part: str, colours: Sequence[str]) -> list[str]:
     """Names such as `red_0` of the cubes in a part of the row; without a row one of each of these colours."""
-    names = env.values.names(part) if env.values.given else [f"{colour}_0" for colour in colours]
+    names = env.values.names(part) if env.values.specified else [f"{colour}_0" for colour in colours]
     for name in names:
         if name.split("_")[0] not in COLOURS:
             raise env.values.error(f"{part}.{name}", f"has an unknown colour; expected one of {', '.join(COLOURS)}")
@@ -136,7 +136,7 @@ def choices_made(ended: Mapping[int, SubTask], letters: str, video: bool) -> set
 def delay(env: Task) -> int:
     """Steps more between what is shown and the execution: a dial, or a value of the row."""
     turned = env.turned("delay")
-    return turned if not turned and not env.values.given else env.values.integer("actions.delay", lambda: turned,
+    return turned if not turned and not env.values.specified else env.values.integer("actions.delay", lambda: turned,
                                                                                  default=0)  # fmt: skip
 
 

@@ -71,7 +71,7 @@ class VideoPlace(Task):
             self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, table, avoid, value=value))
             avoid.append(self.cubes[-1])
         self.targets: list[Disc] = []
-        count = values.count("layout.targets") if values.given else self.target_counts[self.difficulty]
+        count = values.count("layout.targets") if values.specified else self.target_counts[self.difficulty]
         for i in range(count):
             value = f"layout.targets.{i}"
             self.targets.append(add_target(self, draws, f"target_{i}", value, table, TARGET_RADIUS, avoid, gap=H))
@@ -80,10 +80,11 @@ class VideoPlace(Task):
             raise values.error("layout.targets", f"has {count} targets; expected at least 2")
         spot = values.find("layout.goal_xy")
         self.spot.set_home(sapien.Pose([*spot, SUNK_Z], self.spot.pose.q))
-        self.shown = values.indices("objects.demo_ids", lambda: [draws.integer(0, len(self.cubes))], len(self.cubes))
-        if not self.shown:
+        n_cubes = len(self.cubes)
+        self.demonstrated = values.indices("objects.demo_ids", lambda: [draws.integer(0, n_cubes)], n_cubes)
+        if not self.demonstrated:
             raise values.error("objects.demo_ids", "is empty; expected the cubes of the video")
-        self.cube = self.cubes[self.shown[0]]
+        self.cube = self.cubes[self.demonstrated[0]]
         hard = self.difficulty == "hard"
         swapped = values.indices("objects.swap_pair_ids", lambda: draws.permutation(count) if hard else [], count)
         self._swapped = [self.targets[i] for i in swapped[:2]]
