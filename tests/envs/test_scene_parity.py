@@ -172,7 +172,9 @@ def test_a_local_demonstration_is_stored_as_the_official_one(episode: Episode) -
     for name in ("is_video_demo", "is_subgoal_boundary", "is_completed"):
         assert [bool(s.info[name]) for _, s in steps] == [bool(episode.at(k, f"info/{name}")) for k, _ in steps]
     for k, s in steps:
-        local, official = (json.loads(text(a)) for a in (s.action["choice_action"], episode.at(k, "action/choice_action")))
+        local, official = (
+            json.loads(text(a)) for a in (s.action["choice_action"], episode.at(k, "action/choice_action"))
+        )
         assert local.get("choice") == official.get("choice")
         # A place that the robot has touched may round to the next pixel.
         np.testing.assert_allclose(local.get("point") or 0, official.get("point") or 0, atol=1)
