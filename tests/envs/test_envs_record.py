@@ -57,7 +57,7 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
     jobs = [SHORT]
     monkeypatch.setattr(record, "plan", lambda cfg: jobs)
     work = output.with_name("dataset.recording")
-    record._claim(work, jobs)
+    record._claim(work, [job.plan for job in jobs])
     (work / "episodes").mkdir()
     for path in recorded.glob(f"{SHORT.name}.*"):
         (work / "episodes" / path.name).write_bytes(path.read_bytes())
@@ -78,10 +78,10 @@ def test_the_command_saves_both_layouts_and_only_what_is_missing(
 
 
 def test_a_folder_of_another_recording_is_refused(tmp_path: Path) -> None:
-    record._claim(tmp_path, [SHORT])
+    record._claim(tmp_path, [SHORT.plan])
     other = record.Job("PatternLock", 1, seed=1, difficulty="easy", recovery=None, retries=3)
     with pytest.raises(UserError, match="other episodes"):
-        record._claim(tmp_path, [SHORT, other])
+        record._claim(tmp_path, [SHORT.plan, other.plan])
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_button_everything_comes_from_the_stream_in_order(build_task, seed, diff
 
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
-@pytest.mark.parametrize("seed", [2, 6])
+@pytest.mark.parametrize("seed", [6, 10])
 def test_order_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
     env, stream = build_task(VideoPlaceOrder, seed, difficulty), Draws(seed)
     read_scene(stream, env, targets=4)

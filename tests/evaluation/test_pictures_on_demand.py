@@ -94,7 +94,7 @@ def test_a_video_shows_everything_and_changes_nothing(name: str, tmp_path: Path)
     envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1, videos=(str(tmp_path), "all"))
     recorded = roll(policy, JOBS, envs, max_steps=STEPS - 1)
     assert outcomes(recorded) == outcomes(bare)
-    assert {job: env.drawn for job, env in envs.made.items()} == {
+    assert {job: env.rendered for job, env in envs.made.items()} == {
         job: {"front": n, "wrist": n} for job, n in zip(JOBS, FRAMES, strict=True)
     }
     assert all((tmp_path / record.extra["video"]).stat().st_size for record in recorded)

@@ -105,7 +105,7 @@ def test_tokens_are_made_once_for_a_tower_and_again_for_other_frames_or_scores(
     demonstration().save(file)
     baseline = TokenStore.of(tmp_path / "tokens", [nano("framesamp_modul").config, nano("pi05").config])
     read = baseline.read(file)
-    assert read.tokens["front"].shape == (12, 64, 96) and not read.scores and len(baseline.read(file).frames) == 1
+    assert read.tokens["front"].shape == (12, 64, policy.backbone.vision_width) and not read.scores and len(baseline.read(file).frames) == 1
     assert encoded == [12]
     scored = TokenStore.of(tmp_path / "tokens", [nano("tokendrop_modul").config])
     policy = nano("tokendrop_modul")
