@@ -105,10 +105,10 @@ def test_tokens_are_made_once_for_a_tower_and_again_for_other_frames_or_scores(
     demonstration().save(file)
     baseline = TokenStore.of(tmp_path / "tokens", [nano("framesamp_modul").config, nano("pi05").config])
     read = baseline.read(file)
-    assert read.tokens["front"].shape == (12, 64, policy.backbone.vision_width) and not read.scores and len(baseline.read(file).frames) == 1
-    assert encoded == [12]
-    scored = TokenStore.of(tmp_path / "tokens", [nano("tokendrop_modul").config])
     policy = nano("tokendrop_modul")
+    assert read.tokens["front"].shape == (12, 64, policy.backbone.vision_width) and not read.scores
+    assert len(baseline.read(file).frames) == 1 and encoded == [12]
+    scored = TokenStore.of(tmp_path / "tokens", [policy.config])
     rows = scored.read(file).scores[policy.require_memory().storage.scorer]
     assert rows.frames.tolist() == [15, 39, 47, 63, 79, 95, 119, 151] and encoded == [12, 12]
     demonstration((0, 15, 66, 120, 155)).save(file)
