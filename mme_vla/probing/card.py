@@ -173,6 +173,9 @@ def grade(matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes) -> C
             with other noise.
     """
     keys = [key for key in matched if key in again and all(key in outcomes for outcomes in arms.values())]
+    require(
+        keys, "No scene ended in every arm: each ended in an error somewhere. Repeat the command to try them again."
+    )
     noise = _mean({key: abs(matched[key] - again[key]) for key in keys})
     table = {label: {key: matched[key] - outcomes[key] for key in keys} for label, outcomes in arms.items()}
     sampled = dict(zip(table, _bootstrap(list(table.values())), strict=True))
@@ -245,10 +248,10 @@ def _reference(name: str, place: str, plan: ProbePlan) -> float:
 
 
 def _mean(values: Outcomes) -> float:
-    """Mean over tasks of the means over their scenes; NaN without scenes."""
+    """Mean over tasks of the means over their scenes."""
     tasks = dict.fromkeys(key.task for key in values)
     means = [np.mean([value for key, value in values.items() if key.task == task]) for task in tasks]
-    return float(np.mean(means)) if means else float("nan")
+    return float(np.mean(means))
 
 
 def _bootstrap(columns: Sequence[Outcomes]) -> np.ndarray:
