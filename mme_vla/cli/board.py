@@ -16,7 +16,7 @@ from mme_vla.errors import printable
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
 EXAMPLES = (
-    "", "rows=outputs/nano16/reserved --html board.html",
+    "", "rows=outputs/nano16/further --html board.html",
     "--config-dir configs model=mine_modul '+memories.mine={budget: 32, grid: 1}'",
 )  # fmt: skip
 

@@ -82,7 +82,7 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
 class Rows:
     """The models of a run. composed: row → its configuration. choices: at which frames memories read demonstrations.
 
-    fewer: rows of `also`, with fewer trainings and episodes. blind: the row that all others are compared with.
+    blind: the row that all others are compared with.
     """
 
     composed: Mapping[str, Mapping[str, Any]]
