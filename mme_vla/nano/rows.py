@@ -151,9 +151,10 @@ def read_training(folder: Path) -> Training:
 
 
 def _ended(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
-    """The records without the errors of episodes that were repeated."""
+    """The records without the errors of episodes that were repeated, of which the last stays where all are errors."""
+    newest = {record.key: record for record in records if record.outcome == "error"}
     ended = {record.key for record in records if record.outcome != "error"}
-    return [record for record in records if record.outcome != "error" or record.key not in ended]
+    return [r for r in records if r.outcome != "error" or (r.key not in ended and r is newest[r.key])]
 
 
 def _check_identity(

@@ -43,6 +43,7 @@ NOT_RUN = {
     r"mme_vla\.train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
+    r"--checkpoint outputs/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
     r"mme-vla probe card": "needs recorded episodes",
     r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a driver that stands in for one",

@@ -208,6 +208,9 @@ def test_an_episode_twice_is_named(tmp_path: Path) -> None:
     records = records_of(folder)
     write_records(folder, [replace(records[4], outcome="error", error="no"), *records])
     read_training(folder)  # an error that was repeated is no second result
+    error = replace(records[4], outcome="error", error="no")
+    write_records(folder, [*records[:4], error, *records[5:], error])
+    assert len(read_training(folder).records) == len(records), "nor are two errors two results"
     write_records(folder, [*records, replace(records[4], outcome="fail")])
     with pytest.raises(UserError, match=r"framesamp_modul/0 has episodes twice: VideoUnmask 1"):
         read_training(folder)
