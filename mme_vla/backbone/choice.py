@@ -10,7 +10,6 @@ from mme_vla.errors import require
 from mme_vla.registry import HEADS
 from mme_vla.types import Noise, Overlap
 
-
 SPREAD = 0.14
 """Standard deviation of a point about the object that is pointed at, in normalised units."""
 WEIGHT = 0.5  # of a mixture's negative log-likelihood, beside the letter's cross-entropy

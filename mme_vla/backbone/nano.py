@@ -47,7 +47,7 @@ class NanoConfig:
     goal: str = "swap"
     """How vision tokens are read with the goal: see `NanoBackbone.condition_on_prompt`. Checkpoints without it swap."""
     point: str = "regression"
-    """Where the point of a choice comes from: `regression`, or `objects` (`Pointer`). Checkpoints without it regress."""
+    """Where a choice's point comes from: `regression`, or `objects` (`Pointer`). Checkpoints without it regress."""
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")

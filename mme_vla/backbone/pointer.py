@@ -11,7 +11,7 @@ ABSENT = 1e-4  # presence that is added to every one
 
 
 class Pointer(nn.Module):
-    """Weighs the objects that tokens of `PlaceTower` show, by their class and their place, with an action token's query.
+    """Weighs objects that tokens of `PlaceTower` show, by their class and their place, with an action token's query.
 
     Every class of every token is a component of the mixture. What to point at is learned once for all places, where
     regression learns it for each place anew, and the most probable object is taken where regression takes the middle of
