@@ -10,7 +10,7 @@ from mme_vla.evaluation.rollouts import join, rollouts, with_view_tokens
 from mme_vla.processing.normalise import NormStats
 from mme_vla.types import Batch
 
-SCENES = (120, 60, 60, 24)  # new ones of each round
+SCENES = (180, 60, 24)  # new ones of each round
 FIRST_SEED = 3_000_000
 POINTS = {8: (0.2, 0.55), 9: (0.25, 0.75)}  # rows and columns of the image where objects are
 NOISE = 0.2  # on remembered tokens, so that few demonstrations are learned by heart less
@@ -23,7 +23,7 @@ def make_easy_env(task: str, split: str, episode: int, **options):
 
 def learn(policy: MMEPolicy, optimizer: torch.optim.Optimizer, rows: Batch) -> None:
     policy.train()
-    for _ in range(500):
+    for _ in range(900):
         batch = rows.rows(torch.randint(len(rows.prompt), (24,)))
         noisy = batch.history.features + NOISE * torch.randn_like(batch.history.features)
         loss, _ = policy(replace(batch, history=replace(batch.history, features=noisy)))
