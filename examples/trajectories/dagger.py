@@ -10,7 +10,7 @@ from mme_vla.evaluation.rollouts import join, rollouts, with_view_tokens
 from mme_vla.processing.normalise import NormStats
 from mme_vla.types import Batch
 
-SCENES = (180, 60, 24)  # new ones of each round
+SCENES = (180, 40, 24)  # new ones of each round
 FIRST_SEED = 3_000_000
 POINTS = {8: (0.2, 0.55), 9: (0.25, 0.75)}  # rows and columns of the image where objects are
 NOISE = 0.2  # on remembered tokens, so that few demonstrations are learned by heart less
