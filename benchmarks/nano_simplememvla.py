@@ -19,13 +19,13 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 
-from mme_vla.cli.nano import demonstrate
 from mme_vla.config.composition import compose, resolved
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.video import Window
 from mme_vla.nano.demonstrations import Demonstration, Scene
 from mme_vla.nano.learning import statistics
+from mme_vla.nano.runs import Group, demonstrate
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
 from mme_vla.processing.base import Sample
@@ -71,7 +71,7 @@ def record(folder: Path, count: int) -> list[Path]:
     choices: Any = (VideoFrames(window),)
     folder.mkdir(parents=True, exist_ok=True)
     scene = Scene(TASK, FIRST_SEED, LEVEL, folder, tuple(robot.camera_names), choices, False, robot.action)
-    return demonstrate((replace(scene, seed=seed) for seed in itertools.count(FIRST_SEED)), count)
+    return demonstrate([Group((replace(scene, seed=seed) for seed in itertools.count(FIRST_SEED)), count)])
 
 
 def decisions(policy: SimpleMemVlaPolicy, files: Sequence[Path]) -> list[dict[str, Any]]:

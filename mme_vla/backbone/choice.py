@@ -10,6 +10,10 @@ from mme_vla.errors import require
 from mme_vla.registry import HEADS
 from mme_vla.types import Noise, Overlap
 
+SPREAD = 0.14
+"""Standard deviation of a point about the object that is pointed at, in normalised units."""
+WEIGHT = 0.5  # of a mixture's negative log-likelihood, beside the letter's cross-entropy
+
 
 @HEADS.register("choice")
 class ChoiceHead(FlowHead):
@@ -18,6 +22,9 @@ class ChoiceHead(FlowHead):
     The network sees no noise: its noisy chunk is 0 and its flow time 1. A sampled letter is the best score among those
     offered (`ActionSpace.decide`), and a score is a logit with Gumbel noise, so that the choice is an exact sample of
     the softmax over the offered letters.
+
+    A network may give more than a numbers: the logits of m components and their points, 3·m numbers (`Pointer`). Then
+    the point is a mixture of normal distributions about them, and the mean of the most probable component is taken.
 
     Args:
         horizon, action_dim: of a chunk [h, a]. time_distribution: has no effect.
@@ -59,13 +66,36 @@ class ChoiceHead(FlowHead):
         return {"noise": noise}
 
     def loss(self, predict: Predict, actions: Tensor, noise: Mapping[str, Tensor]) -> Tensor:
-        """The loss [b, h]: cross-entropy of the letter plus the mean squared error of the other numbers."""
+        """The loss [b, h]: cross-entropy of the letter, plus the mean squared error of the other numbers.
+
+        Of a mixture it is plus half the negative log-likelihood, up to a constant, instead.
+        """
         output = predict(noise["noise"], noise["time"]).float()
         letters = actions[..., self.choice].argmax(-1)
         loss = nn.functional.cross_entropy(output[..., self.choice].movedim(-1, 1), letters, reduction="none")
-        if self.numbers:
-            loss = loss + (output[..., self.numbers] - actions[..., self.numbers].float()).square().mean(-1)
-        return loss
+        if not self.numbers:
+            return loss
+        numbers = actions[..., self.numbers].float()
+        if output.shape[-1] == self.action_dim:
+            return loss + (output[..., self.numbers] - numbers).square().mean(-1)
+        logits, points = self._mixture(output)
+        distance = (points - numbers[..., None, :]).square().sum(-1)
+        return loss - WEIGHT * (logits.log_softmax(-1) - distance / (2 * SPREAD**2)).logsumexp(-1)
+
+    def _mixture(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Logits [b, h, m] and points [b, h, m, 2]."""
+        logits, points = output[..., self.action_dim :].tensor_split([(output.shape[-1] - self.action_dim) // 3], -1)
+        return logits, points.unflatten(-1, (-1, 2))
+
+    def _means(self, output: Tensor) -> Tensor:
+        """Logits of the letters and means of the other numbers [b, h, a]."""
+        if output.shape[-1] == self.action_dim:
+            return output
+        logits, points = self._mixture(output)
+        best = logits.argmax(-1)[..., None, None].expand(*logits.shape[:-1], 1, 2)
+        means = output[..., : self.action_dim].clone()
+        means[..., self.numbers] = points.gather(-2, best)[..., 0, :]
+        return means
 
     def times(self, steps: int, device: torch.device) -> Tensor:
         """Ones [steps]."""
@@ -80,7 +110,7 @@ class ChoiceHead(FlowHead):
         increments: Tensor | None = None,
     ) -> Tensor:
         """Scores of the letters and the other numbers, [b, h, a]."""
-        output = predict(torch.zeros_like(noise), 0).float()
+        output = self._means(predict(torch.zeros_like(noise), 0).float())
         scale = output.new_full((self.action_dim,), self.deviation)
         scale[self.choice] = self.temperature
         return output + scale * noise
@@ -96,7 +126,7 @@ class ChoiceHead(FlowHead):
             Log-probability of the letter, plus the log-density of the other numbers if `deviation` is positive.
         """
         require(self.temperature > 0, "backbone.head.temperature=0 has no log-probability: set a positive temperature.")
-        output = predict(torch.zeros_like(chunk), 0).float()
+        output = self._means(predict(torch.zeros_like(chunk), 0).float())
         logits, scores = output[..., self.choice] / self.temperature, chunk[..., self.choice]
         if options is not None:
             logits, scores = (x.masked_fill(~options[:, None], -torch.inf) for x in (logits, scores))

@@ -13,11 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hook, Injection, bind_hook
+from mme_vla.backbone.choice import ChoiceHead
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.flow import HasFlowHead, Predict, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, attend
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower
 from mme_vla.backbone.pi05 import initialise
+from mme_vla.backbone.pointer import Pointer
 from mme_vla.backbone.tower import PlaceTower, TowerConfig, load_shipped
 from mme_vla.errors import check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
@@ -44,6 +46,8 @@ class NanoConfig:
     head: Mapping[str, Any] = field(default_factory=lambda: {"name": "clean_flow"}, hash=False)
     goal: str = "swap"
     """How vision tokens are read with the goal: see `NanoBackbone.condition_on_prompt`. Checkpoints without it swap."""
+    point: str = "regression"
+    """Where a choice's point comes from: `regression`, or `objects` (`Pointer`). Checkpoints without it regress."""
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
@@ -52,6 +56,12 @@ class NanoConfig:
             self.goal == "text" or self.vision.layout == "segments",
             f"backbone.vision.layout={self.vision.layout}: backbone.goal=swap needs segments; use backbone.goal=text.",
         )
+        check_choice("backbone.point", self.point, ("objects", "regression"))
+        require(
+            self.point == "regression" or self.vision.layout == "places",
+            f"backbone.vision.layout={self.vision.layout}: backbone.point=objects needs places; use "
+            "backbone.point=regression.",
+        )
         check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)
         check_choice("backbone.time_distribution", self.time_distribution, ("beta", "uniform"))
@@ -59,6 +69,7 @@ class NanoConfig:
 
 MAX_VIEWS, MAX_WORDS = 4, 256
 GOAL_QUERIES = 4
+SHARPNESS = 4.0  # of fresh queries: each begins with a few words of a goal, where equal weights would dilute its colour
 FIRST = CLASSES.index("red cube") - 1
 """Index, among the classes of a token, of the class that the goal names."""
 STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
@@ -151,12 +162,16 @@ class Column(nn.Module):
 
 
 class Context(NamedTuple):
-    """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d]."""
+    """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d].
+
+    seen: tokens of the first view [b, n, D] to point at; None without a pointer.
+    """
 
     keys_values: Tensor
     mask: Tensor
     condition: Tensor
     hook: Hook | None
+    seen: Tensor | None
 
 
 @BACKBONES.register("nano")
@@ -215,7 +230,16 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         for name, module in self.named_children():
             if name != "vision":
                 initialise(module)
+        if self.goal_reader is not None:
+            with torch.no_grad():
+                self.goal_reader.queries.weight.mul_(SHARPNESS)
+        self.pointer = Pointer(action_width, width) if config.point == "objects" else None  # has its own fresh weights
         self.make_head(config)
+        require(
+            self.pointer is None or (isinstance(self.head, ChoiceHead) and len(self.head.numbers) == 2),
+            "backbone.point=objects is of choices with a point: set backbone=nano_choice and "
+            "embodiment=robomme_choice_front, or backbone.point=regression.",
+        )
 
     def init_experts(self, names: Sequence[str]) -> None:
         """Give the columns of these experts fresh weights."""
@@ -259,11 +283,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     def embed(self, batch: Batch) -> list[Block]:
         """Blocks `images`, of all views (`batch.view_tokens` where they were encoded before), and `prompt`."""
         views = batch.images.shape[1]
-        if batch.view_tokens is None:
-            tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, (-1, views))
-        else:
-            tokens = batch.view_tokens.to(self.places.weight.dtype)
-        tokens = self.condition_on_prompt(tokens, batch.prompt, batch.prompt_mask)
+        tokens = self.condition_on_prompt(self._view_tokens(batch, views), batch.prompt, batch.prompt_mask)
         located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
         encoded = located + self.see(located)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
@@ -271,6 +291,12 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             Block("images", encoded.flatten(1, 2), image_mask, "vlm"),
             Block("prompt", self._words(batch.prompt), batch.prompt_mask, "vlm"),
         ]
+
+    def _view_tokens(self, batch: Batch, views: int) -> Tensor:
+        """The tower's tokens of the first views [b, v, n, D]."""
+        if batch.view_tokens is None:
+            return self.encode_images(batch.images[:, :views].flatten(0, 1)).unflatten(0, (-1, views))
+        return batch.view_tokens[:, :views].to(self.places.weight.dtype)
 
     def _words(self, prompt: Tensor) -> Tensor:
         words: Tensor = self.embedding(prompt) + self.positions.weight[: prompt.shape[1]]
@@ -326,17 +352,22 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             condition = condition + self.goal_reader.condition(self.goal_reader(prompt.tokens, prompt.mask))
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
-        return Context(keys_values, mask, condition, injection.hook)
+        seen = None if self.pointer is None else self._view_tokens(batch, 1)[:, 0]
+        return Context(keys_values, mask, condition, injection.hook, seen)
 
     def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
-        """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]."""
+        """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]; behind them what points."""
         condition = self.time_in(time_embedding(time, self.config.action.width))
         condition = condition + context.condition.repeat_interleave(versions, 0)
         x = self.action_in(x_t) + self.steps.weight + condition[:, None]
         for i, layer in enumerate(self.layers):
             x = layer(x, condition, *context.keys_values[i], context.mask, versions, bind_hook(context.hook, i))
-        output: Tensor = self.action_out(self.final(x)[0]).float()
-        return output
+        x = self.final(x)[0]
+        output: Tensor = self.action_out(x)
+        if self.pointer is not None:
+            assert context.seen is not None
+            output = torch.cat([output, self.pointer(x, context.seen.repeat_interleave(versions, 0))], -1)
+        return output.float()
 
     def recompute(self, mode: Recompute) -> None:
         """No effect: a layer's activations are a chunk's few tokens."""

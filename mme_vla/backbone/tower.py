@@ -28,6 +28,8 @@ FLOOR = 0.1
 """Presence from which on a cell counts: a thousand nearly empty cells add up to nothing."""
 FAINT = 0.1
 """Objects of a class that an image must show at least for its shares to add up to about one."""
+NEARLY_ABSENT = 0.02
+"""Share, times its factor, that is added to every one: where a class is absent, a place is no division by zero."""
 IN_USE = 5 / 8
 """The part of an image's height, from the top, that the network sees: nothing lies on the table below it."""
 NOTHING = -10.0  # logit of presence there
@@ -180,6 +182,23 @@ def summarise(presence: Tensor, offsets: Tensor) -> Tensor:
     parts = [nn.functional.max_pool2d(counted, CELLS), *sums.chunk(3, 1), waves]
     tokens = torch.cat([part * factor for part, factor in zip(parts, FACTORS, strict=True)], 1)
     return tokens.flatten(2).transpose(1, 2)
+
+
+def located(tokens: Tensor) -> tuple[Tensor, Tensor]:
+    """What the tokens [..., 20·K] of `PlaceTower` say of each class: its presence [..., K], and where [..., K, 2].
+
+    Places are column and row, −1 … 1 between `COLUMNS` and `ROWS`; where a class is absent they mean nothing.
+    """
+    presence, share, column, row = tokens[..., : 4 * len(CLASSES)].chunk(4, -1)
+    where = torch.stack([column, row], -1) / (share[..., None].clamp(min=0) + NEARLY_ABSENT)
+    return presence.clamp(0, 1), where.clamp(-1, 1)
+
+
+def place_waves(where: Tensor) -> Tensor:
+    """cos(πi·c)·cos(πj·r) of places [..., 2], i and j from 0 to 3: [..., 16], as a token's waves are of one object."""
+    orders = torch.arange(WAVES, device=where.device, dtype=where.dtype) * math.pi
+    across, along = (orders * (where[..., None] + 1) / 2).cos().unbind(-2)
+    return (across[..., :, None] * along[..., None, :]).flatten(-2)
 
 
 def _by_token(x: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ from mme_vla.types import Batch, HistoryTokens, stack_noise
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 JOINT_NOISE = 0.05
+VIEW_NOISE = 0.25  # on tokens of current images: what points at an object reads its place there
 MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
 
 
@@ -90,7 +91,8 @@ class Decisions(Dataset[int]):
     distant: [n] bool; decisions on a motion to another place than the last one's, which are hard and few: each is
         an item `oversample` times.
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
-        to each number of a token and, `JOINT_NOISE` of it, to each joint (radians).
+        to each number of a remembered token, `VIEW_NOISE` of it to those of current images, and `JOINT_NOISE` of it to
+        each joint (radians).
     token_noise: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
     replay: selects the history of a decision anew in each epoch, where transforms change the demonstrations' frames.
     """
@@ -169,7 +171,8 @@ class Decisions(Dataset[int]):
             return (values + size * torch.randn(values.shape, generator=generator)).to(values.dtype)
 
         assert batch.state is not None and batch.view_tokens is not None
-        size = {name: self.noise + self.token_noise * std for name, std in self._token_std.items()}
+        fixed = {"views": VIEW_NOISE * self.noise, "past": self.noise}
+        size = {name: fixed[name] + self.token_noise * std for name, std in self._token_std.items()}
         joints = perturbed(
             batch.state[:, :-1], JOINT_NOISE * self.noise
         )  # the last number is the gripper's, centimetres

@@ -1,6 +1,7 @@
 """Normalisation of states and actions by quantiles or by extremes, and the running statistics it needs."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
@@ -82,12 +83,18 @@ class NormStats:
     actions: QuantileStats
 
     @classmethod
-    def unit(cls, state_width: int, action_width: int) -> Self:
-        """Statistics that leave numbers about as they are: −1 and 1 stay."""
+    def unit(cls, state_width: int, action_width: int, ranges: Mapping[int, tuple[float, float]] | None = None) -> Self:
+        """Statistics that leave numbers about as they are: −1 and 1 stay.
+
+        Args:
+            ranges: number of an action → the lowest and the highest value, which become −1 and 1.
+        """
         sides = []
-        for width in (state_width, action_width):
-            ones = np.ones(width)
-            sides.append(QuantileStats(0 * ones, ones.copy(), -ones, ones, -ones, ones))
+        for width, given in ((state_width, {}), (action_width, ranges or {})):
+            low, high = -np.ones(width), np.ones(width)
+            for place, ends in given.items():
+                low[place], high[place] = ends
+            sides.append(QuantileStats((low + high) / 2, (high - low) / 2, low, high, low.copy(), high.copy()))
         return cls(*sides)
 
     def to_dict(self) -> dict[str, Any]:

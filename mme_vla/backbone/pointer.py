@@ -1,0 +1,46 @@
+"""Pointing at what a tower has located: the point of a choice as a mixture of objects' places."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.tower import CLASSES, WAVES, located, place_waves
+
+ABSENT = 1e-4  # presence that is added to every one
+
+
+class Pointer(nn.Module):
+    """Weighs objects that tokens of `PlaceTower` show, by their class and their place, with an action token's query.
+
+    Every class of every token is a component of the mixture. What to point at is learned once for all places, where
+    regression learns it for each place anew, and the most probable object is taken where regression takes the middle of
+    several.
+
+    Args:
+        action_width: of an action token. width: of queries and keys.
+    """
+
+    def __init__(self, action_width: int, width: int) -> None:
+        super().__init__()
+        self.query = nn.Linear(action_width, width)
+        self.classes = nn.Embedding(len(CLASSES), width)
+        self.near = nn.Linear(WAVES**2, width, bias=False)
+        self.visible = nn.Parameter(torch.ones(()))
+        self.point = nn.Linear(2, 2)
+        with torch.no_grad():
+            self.point.weight.copy_(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))  # a point is row and column
+            self.point.bias.zero_()
+
+    def forward(self, actions: Tensor, tokens: Tensor) -> Tensor:
+        """Logits of m = n·K components, then their points, [b, h, 3·m].
+
+        Args:
+            actions: [b, h, d]. tokens: of the tower, [b, n, 20·K].
+        """
+        presence, where = located(tokens.to(self.near.weight.dtype))
+        keys = (self.classes.weight + self.near(place_waves(where))).flatten(1, 2)
+        logits = self.query(actions) @ keys.transpose(1, 2) / math.sqrt(keys.shape[-1])
+        logits = logits + (self.visible * (presence + ABSENT).log()).flatten(1)[:, None]
+        points = self.point(where).flatten(1)[:, None]
+        return torch.cat([logits, points.expand(-1, actions.shape[1], -1)], -1)
