@@ -232,13 +232,13 @@ class Board:
 
     def targets(self) -> list[Target]:
         """What the best policy is to reach, and its advantage over the floor of as many parameters."""
-        names = ("best memory solves at least 60 % of all episodes", f"`{MATCHED}` solves at most half of that")
+        names = ("best memory solves at least 60 % of all episodes", f"{MATCHED} solves at most half of that")
         best, matched = next(iter(self.of_kind("policy")), None), [row for row in self.rows if row.name == MATCHED]
         if best is None:
             return [Target(name) for name in names]
         low, high = percentiles(self.draws([best], self.protocol.tasks)[0])
         success = self.success(best)
-        first = Target(names[0], f"{success:.1f} % (`{best.name}`)", f"[{low:.1f}, {high:.1f}]", reached=success >= 60)
+        first = Target(names[0], f"{success:.1f} % ({best.name})", f"[{low:.1f}, {high:.1f}]", reached=success >= 60)
         if not matched:
             return [first, Target(names[1])]
         ratios = np.divide(*self.draws([matched[0], best], self.protocol.tasks))

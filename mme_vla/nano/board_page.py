@@ -32,7 +32,7 @@ def ranking(board: Board, brief: bool = False) -> Table:
         costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
         strong |= {len(rows)} if row.is_local else set()
         rows.append([row.name, at, trainings, show(row.average), span(row.average), *cells, *costs])
-    return Table(f"Ranking, split `{board.split}`", columns, rows, strong=strong)
+    return Table(f"Ranking, split {board.split}", columns, rows, strong=strong)
 
 
 def tasks(board: Board) -> Table:

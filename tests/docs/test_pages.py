@@ -15,7 +15,8 @@ WORKFLOWS = REPOSITORY / ".github" / "workflows"
 
 
 def prose(text: str) -> str:
-    """A page without code and tables."""
+    """A page without code, tables and what the board of nanoMME writes."""
+    text = re.sub(r"<!-- board -->.*?<!-- /board -->", " ", text, flags=re.DOTALL)
     text = re.sub(r"`[^`]*`", " x ", re.sub(r"```.*?```", " ", text, flags=re.DOTALL))
     return "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("|"))
 
