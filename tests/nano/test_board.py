@@ -109,7 +109,7 @@ def test_targets_have_intervals_and_are_not_reached_by_weak_evidence(board: Boar
     assert [t.test for t in suites] == [f"{n} : 0, p = 1.0000" for n in (2, 3, 3, 3)]
     assert not any(t.reached for t in suites)
     alone = Board(read_rows([write_training(tmp_path, "a", 0, 1).parent]), samples=50)
-    assert [t.measured for t in alone.targets()] == ["33.3 % (`a`)", "not run yet"]
+    assert [t.measured for t in alone.targets()] == ["33.3 % (a)", "not run yet"]
 
 
 def test_tasks_that_separate_memories_stand_out() -> None:
