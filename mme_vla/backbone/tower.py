@@ -167,8 +167,8 @@ def summarise(presence: Tensor, offsets: Tensor) -> Tensor:
     """
     side = presence.shape[-1]
     middles = torch.arange(side, device=presence.device, dtype=presence.dtype) + 0.5
-    column = _within((offsets[:, :, 0] + middles) / side, COLUMNS)
-    row = _within((offsets[:, :, 1] + middles[:, None]) / side, ROWS)
+    column = within((offsets[:, :, 0] + middles) / side, COLUMNS)
+    row = within((offsets[:, :, 1] + middles[:, None]) / side, ROWS)
     counted = (presence - FLOOR).clamp(min=0) / (1 - FLOOR)
     mass = counted / CELLS_PER_OBJECT
     share = mass / (mass.sum((-2, -1), keepdim=True) + FAINT)
@@ -206,7 +206,7 @@ def _by_token(x: Tensor) -> Tensor:
     return x.unflatten(-1, (-1, CELLS)).unflatten(-3, (-1, CELLS)).permute(0, 1, 3, 5, 2, 4, 6).flatten(-2)
 
 
-def _within(place: Tensor, ends: tuple[float, float]) -> Tensor:
+def within(place: Tensor, ends: tuple[float, float]) -> Tensor:
     """Places of 0 … 1 in an image as −1 … 1 between two of its places of −1 … 1."""
     low, high = ends
     return (2 * place - 1 - (low + high) / 2) / ((high - low) / 2)

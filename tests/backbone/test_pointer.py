@@ -7,7 +7,7 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.choice import SPREAD, WEIGHT, ChoiceHead
 from mme_vla.backbone.pointer import Pointer
-from mme_vla.backbone.tower import CLASSES, COLUMNS, ROWS, located, summarise
+from mme_vla.backbone.tower import CLASSES, COLUMNS, ROWS, located, summarise, within
 from mme_vla.nano.pretraining import label_cells
 
 RED, BLUE = CLASSES.index("red cube"), CLASSES.index("blue cube")
@@ -17,10 +17,6 @@ def image_of(*objects: tuple[int, float, float]) -> torch.Tensor:
     """Tokens [1, 64, d] of an image with objects: class, column and row as shares of its side."""
     kinds, places = torch.tensor([o[0] for o in objects]), torch.tensor([o[1:] for o in objects])
     return summarise(*label_cells(torch.zeros(len(objects), dtype=torch.long), kinds, places, (1, 32)))
-
-
-def within(share: float, ends: tuple[float, float]) -> float:
-    return (2 * share - 1 - sum(ends) / 2) / ((ends[1] - ends[0]) / 2)
 
 
 def test_tokens_say_where_an_object_is() -> None:
