@@ -18,7 +18,7 @@ import sapien
 
 from helpers.env_scenes import Scene
 from mme_vla.envs.robot.kinematics import Arm, matrix_of
-from mme_vla.envs.robot.planning import CONTROL_STEP, plan_screw
+from mme_vla.envs.robot.planning import CONTROL_STEP, goal_in_base, plan_screw
 
 FILE = "screw_plans.json.gz"
 KEPT = Path(__file__).resolve().parents[1] / "data" / FILE
@@ -42,7 +42,8 @@ def test_screw_plans_equal_the_reference(arm: Arm, path: Path) -> None:
         assert plan["time_step"] == CONTROL_STEP
         arm.base = sapien.Pose(*plan["base"])
         limits = plan["velocity_limit"], plan["acceleration_limit"]
-        rows = plan_screw(arm, np.array(plan["qpos"]), sapien.Pose(*plan["target"]), *limits)
+        target = sapien.Pose(*plan["target"])
+        rows = plan_screw(arm, np.array(plan["qpos"]), target, *limits, precision=np.float64)
         assert rows is not None and rows.shape == np.shape(plan["rows"])
         np.testing.assert_allclose(rows, plan["rows"], rtol=0, atol=1e-12)
 
@@ -54,3 +55,12 @@ def test_poses_keep_double_precision(arm: Arm) -> None:
     assert 1e-11 < shifted < 1e-9
     rotation = matrix_of(sapien.Pose([0, 0, 0], [0.5, 0.5, 0.5, 0.5]))[:3, :3]
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
+
+
+def test_goals_take_the_length_of_quaternions_in_single_precision(arm: Arm) -> None:
+    held = np.array([0.00250886, 0.99119306, 0.13237302, 0.00056358], np.float32)
+    for scale in (1, np.float32(1 + 2e-7)):
+        target = sapien.Pose([0, 0, 0.2], held * scale)
+        single = goal_in_base(arm.base, target)
+        np.testing.assert_allclose(single[:3, :3] @ single[:3, :3].T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(single, goal_in_base(arm.base, target, np.float64), rtol=0, atol=1e-9)

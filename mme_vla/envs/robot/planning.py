@@ -12,6 +12,7 @@ import sapien
 import toppra
 from ompl import base, geometric, util
 from toppra import algorithm, constraint
+from transforms3d.quaternions import mat2quat, quat2mat
 
 from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.envs.robot.kinematics import Arm, matrix_of
@@ -31,7 +32,12 @@ logging.getLogger("toppra").setLevel(logging.ERROR)
 
 
 def plan_screw(
-    arm: Arm, qpos: np.ndarray, target_pose: sapien.Pose, velocity_limit: float = 0.9, acceleration_limit: float = 0.9
+    arm: Arm,
+    qpos: np.ndarray,
+    target_pose: sapien.Pose,
+    velocity_limit: float = 0.9,
+    acceleration_limit: float = 0.9,
+    precision: type[np.floating[Any]] = np.float32,
 ) -> np.ndarray | None:
     """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
 
@@ -44,13 +50,14 @@ def plan_screw(
             demonstrations of the gripper, double in those of the stick.
         target_pose: of the tool centre point in the world.
         velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
+        precision: of the target's quaternion; single in official demonstrations.
 
     Returns:
         Joint targets [n, 7], the first being the present angles; None where a joint limit is in the way, the motion
         stalls at a singularity, or the displacement turns the tool by half a turn.
     """
     joints = np.array(qpos)[:ARM_JOINTS]
-    goal = np.linalg.inv(matrix_of(arm.base)) @ matrix_of(target_pose)
+    goal = goal_in_base(arm.base, target_pose, precision)
     displacement = goal @ np.linalg.inv(arm.transform(joints))
     remaining = twist_of(displacement)
     if remaining is None:
@@ -123,6 +130,23 @@ def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: fl
     if passage is None:
         return None
     return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / CONTROL_STEP))))
+
+
+def goal_in_base(
+    base_pose: sapien.Pose, target_pose: sapien.Pose, precision: type[np.floating[Any]] = np.float32
+) -> np.ndarray:
+    """A pose in the world as a matrix [4, 4] in the base's frame, rounded as by `mplib` with NumPy 1.
+
+    It divides by the quaternion's squared length, summed in the pose's own precision. In single precision the rest is
+    up to 1e-7, which a rotation must not have: the tool is turned by up to 1e-9.
+    """
+    w, x, y, z = np.asarray(target_pose.q, precision)
+    summed, exact = (w * w + x * x + y * y + z * z), np.square(target_pose.q, dtype=np.float64).sum()
+    goal = matrix_of(target_pose)
+    goal[:3, :3] = np.eye(3) + exact / float(summed) * (goal[:3, :3] - np.eye(3))
+    goal = np.linalg.inv(matrix_of(base_pose)) @ goal
+    goal[:3, :3] = quat2mat(mat2quat(goal[:3, :3]))
+    return goal
 
 
 def twist_of(transform: np.ndarray) -> np.ndarray | None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sapien
 import sapien.render
+import torch
+from mani_skill.utils.geometry.rotation_conversions import euler_angles_to_matrix, matrix_to_quaternion
 from transforms3d.euler import euler2quat
 
 from mme_vla.envs.scene.things import Thing
@@ -168,10 +170,20 @@ class Board(Thing):
     """A low square frame on the table; things thrown into its hole cannot be seen."""
 
 
+def cube_pose(xy: XY, yaw: float, half_size: float = H) -> sapien.Pose:
+    """Pose of a cube on the table, turned by tensors in single precision, as in the benchmark.
+
+    The last bit of its quaternion decides the order of the axes of its bounding box, and so where the next object is
+    placed.
+    """
+    q = matrix_to_quaternion(euler_angles_to_matrix(torch.tensor([0.0, 0.0, yaw]), "XYZ"))
+    return sapien.Pose([float(xy[0]), float(xy[1]), half_size], q.numpy())
+
+
 def build_cube(env: "Stage", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:
     """A cube lying on the table."""
     rgb = COLOURS[colour] if isinstance(colour, str) else colour
-    actor = Shapes(env).solid_box([half_size] * 3, rgb).build(name, at(xy, half_size, yaw))
+    actor = Shapes(env).solid_box([half_size] * 3, rgb).build(name, cube_pose(xy, yaw, half_size))
     return Cube(name, actor, colour, half_size)
 
 

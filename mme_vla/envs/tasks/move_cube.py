@@ -7,7 +7,7 @@ import numpy as np
 import sapien
 
 from mme_vla.envs.scene.articulated import PEG_COLOUR, build_peg
-from mme_vla.envs.scene.objects import H, at, build_cube, build_disc
+from mme_vla.envs.scene.objects import H, at, build_cube, build_disc, cube_pose
 from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
 from mme_vla.envs.scene.predicates import dropped_onto, gripper_open, picked_up, pushed_onto
 from mme_vla.envs.subtasks import Choice, SubTask
@@ -59,7 +59,7 @@ class MoveCube(Task):
         self._execution_poses = {
             self.peg: at(peg[:2], 0, peg[2]),
             self.target: sapien.Pose([*goal, self.target.position[2]], self.target.pose.q),
-            self.cube: at(xy, H, yaw),
+            self.cube: cube_pose(xy, yaw),
         }
 
     def _place_peg(self, draws: Draws, part: str) -> tuple[float, float, float]:
