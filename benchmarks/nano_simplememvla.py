@@ -1,9 +1,9 @@
-"""SimpleMemVLA at nano size, with its video or without, on SwingXtimes by choices: demonstrations, then training.
+"""SimpleMemVLA at nano size, with its video or without, on one task by choices: demonstrations, then training.
 
-python benchmarks/nano_simplememvla.py record --folder data/swing --count 70
-python benchmarks/nano_simplememvla.py train --folder data/swing --output outputs/video
-python benchmarks/nano_simplememvla.py train --folder data/swing --output outputs/no_video --no-video
-python benchmarks/nano_simplememvla.py measure --folder data/swing --output outputs/video/checkpoints/step_000300
+python benchmarks/nano_simplememvla.py record --folder data/move --count 120
+python benchmarks/nano_simplememvla.py train --folder data/move --count 120 --output outputs/video
+python benchmarks/nano_simplememvla.py train --folder data/move --count 120 --output outputs/no_video --no-video
+python benchmarks/nano_simplememvla.py measure --folder data/move --count 120 --output outputs/video/checkpoints/step_000400
 
 Frames are rendered only at decisions and where the video shows them. `mme-vla evaluate checkpoint=…` evaluates.
 """
@@ -36,7 +36,7 @@ from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.types import stack_noise
 
-TASK, LEVEL, FIRST_SEED = "SwingXtimes", "easy", 3_000_000
+LEVEL, FIRST_SEED = "easy", 3_000_000
 HELD_OUT = 10  # one demonstration in so many only measures the loss
 WORDS = (
     "model=simplememvla", "backbone=simplememvla_nano", "embodiment=robomme_choice_front",
@@ -63,14 +63,14 @@ def composed(*words: str) -> dict[str, Any]:
     return resolved(compose("train", [*WORDS, *words]))
 
 
-def record(folder: Path, count: int) -> list[Path]:
+def record(task: str, folder: Path, count: int) -> list[Path]:
     """Demonstrations that succeed, the first so many seeds; existing ones are not made again."""
     config = composed()
     window_section, robot = config["processor"], embodiment_of(config)
     window = Window(window_section["seconds"], window_section["fps"], window_section["native_fps"])
     choices: Any = (VideoFrames(window),)
     folder.mkdir(parents=True, exist_ok=True)
-    scene = Scene(TASK, FIRST_SEED, LEVEL, folder, tuple(robot.camera_names), choices, False, robot.action)
+    scene = Scene(task, FIRST_SEED, LEVEL, folder, tuple(robot.camera_names), choices, False, robot.action)
     return demonstrate([Group((replace(scene, seed=seed) for seed in itertools.count(FIRST_SEED)), count)])
 
 
@@ -135,12 +135,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("command", choices=("record", "train", "measure"))
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--task", default="MoveCube")
     parser.add_argument("--count", type=int, default=70)
     parser.add_argument("--output", type=Path, help="of train: a run folder; of measure: a checkpoint")
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("overrides", nargs="*", help="train.steps=400 …")
     args = parser.parse_intermixed_args()
-    files = record(args.folder, args.count)
+    files = record(args.task, args.folder, args.count)
     if args.command == "measure":
         measure(files, args.output)
     elif args.command == "train":

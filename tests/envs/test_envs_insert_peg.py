@@ -129,7 +129,7 @@ def test_on_the_way_back_from_the_video_the_pegs_are_where_they_were(env):
         np.testing.assert_allclose(peg.pose.p, peg.initial_pose.p, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", [710002, 9000005, 9000014], ids=["beside the box", "flung off", "out of reach"])
+@pytest.mark.parametrize("seed", [710002, 9000063, 9000014], ids=["beside the box", "flung off", "out of reach"])
 def test_where_the_official_demonstrator_fails_the_local_one_retries(build_task, seed: int):
     env = build_task(InsertPeg, seed, "easy")
     assert steps_of_demonstration(env) is not None

@@ -42,8 +42,7 @@ def test_screw_plans_equal_the_reference(arm: Arm, path: Path) -> None:
         assert plan["time_step"] == CONTROL_STEP
         arm.base = sapien.Pose(*plan["base"])
         limits = plan["velocity_limit"], plan["acceleration_limit"]
-        target = sapien.Pose(*plan["target"])
-        rows = plan_screw(arm, np.array(plan["qpos"]), target, *limits, precision=np.float64)
+        rows = plan_screw(arm, np.array(plan["qpos"]), sapien.Pose(*plan["target"]), *limits)
         assert rows is not None and rows.shape == np.shape(plan["rows"])
         np.testing.assert_allclose(rows, plan["rows"], rtol=0, atol=1e-12)
 
@@ -61,6 +60,6 @@ def test_goals_take_the_length_of_quaternions_in_single_precision(arm: Arm) -> N
     held = np.array([0.00250886, 0.99119306, 0.13237302, 0.00056358], np.float32)
     for scale in (1, np.float32(1 + 2e-7)):
         target = sapien.Pose([0, 0, 0.2], held * scale)
-        single = goal_in_base(arm.base, target)
+        single = goal_in_base(arm.base, target, np.float32)
         np.testing.assert_allclose(single[:3, :3] @ single[:3, :3].T, np.eye(3), atol=1e-14)
-        np.testing.assert_allclose(single, goal_in_base(arm.base, target, np.float64), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(single, goal_in_base(arm.base, target), rtol=0, atol=1e-9)

@@ -136,7 +136,7 @@ class RobotControl:
         velocity, acceleration = LIMITS[self.env.stick]
         # The screw planner has no randomness: what fails once fails always.
         qpos = np.asarray(self.env.qpos, np.float64 if self.env.stick else np.float32)
-        plan = plan_screw(self.arm, qpos, pose, velocity, acceleration)
+        plan = plan_screw(self.arm, qpos, pose, velocity, acceleration, np.float32)
         if plan is not None:
             return plan
         for seed in range(FREE_TRIES):

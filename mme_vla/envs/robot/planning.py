@@ -37,7 +37,7 @@ def plan_screw(
     target_pose: sapien.Pose,
     velocity_limit: float = 0.9,
     acceleration_limit: float = 0.9,
-    precision: type[np.floating[Any]] = np.float32,
+    precision: type[np.floating[Any]] = np.float64,
 ) -> np.ndarray | None:
     """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
 
@@ -50,7 +50,7 @@ def plan_screw(
             demonstrations of the gripper, double in those of the stick.
         target_pose: of the tool centre point in the world.
         velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
-        precision: of the target's quaternion; single in official demonstrations.
+        precision: in which the length of the target's quaternion is summed; single in official demonstrations.
 
     Returns:
         Joint targets [n, 7], the first being the present angles; None where a joint limit is in the way, the motion
@@ -133,7 +133,7 @@ def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: fl
 
 
 def goal_in_base(
-    base_pose: sapien.Pose, target_pose: sapien.Pose, precision: type[np.floating[Any]] = np.float32
+    base_pose: sapien.Pose, target_pose: sapien.Pose, precision: type[np.floating[Any]] = np.float64
 ) -> np.ndarray:
     """A pose in the world as a matrix [4, 4] in the base's frame, rounded as by `mplib` with NumPy 1.
 

@@ -6,7 +6,7 @@ Shapes: L tokens.
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
@@ -100,11 +100,6 @@ class WordTokenizer:
     def id(self, token: str) -> int:
         """The id of a special token."""
         return int(self._tokenizer.token_to_id(token))
-
-    @cached_property
-    def line_breaks(self) -> frozenset[int]:
-        """Ids of one and of two line breaks."""
-        return frozenset(self.encode("\n") + self.encode("\n\n"))
 
 
 @lru_cache(maxsize=2)
@@ -239,14 +234,18 @@ def encode(
 ) -> Tokens:
     """A prompt as tokens, and behind it the response that is learned.
 
+    The prompt is encoded by itself, so it is the same in training and where a response is generated. With the
+    published tokenizer this makes no difference, since it separates line breaks from words.
+
     Args:
         cameras: in the order in which they are shown. request: of `instruction`. response: of `clean_response`.
     """
     views = "".join(camera.expanded for camera in cameras)
-    text = f"<|im_start|>user\n{views}{request}<|im_end|>\n<|im_start|>assistant\n<think>\n\n</think>\n\n"
-    if response is not None:
-        text += f"{response}<|im_end|>\n"
-    ids = np.array(tokenizer.encode(text), np.int64)
+    prompt = tokenizer.encode(
+        f"<|im_start|>user\n{views}{request}<|im_end|>\n<|im_start|>assistant\n<think>\n\n</think>\n\n"
+    )
+    learned = [] if response is None else tokenizer.encode(f"{response}<|im_end|>\n")
+    ids = np.array([*prompt, *learned], np.int64)
     kinds = np.zeros(len(ids), np.int8)
     kinds[ids == tokenizer.id("<|image_pad|>")] = IMAGE
     video = np.flatnonzero(ids == tokenizer.id("<|video_pad|>"))
@@ -259,15 +258,7 @@ def encode(
     prefix, first = 0, cameras[0]
     if first.times is not None and len(first.times) > 1:
         prefix = int(video[first.memory + (len(first.times) - 1) * first.grid[0] * first.grid[1] - 1]) + 1
-    return Tokens(ids, kinds, rope_positions(kinds, cameras), response_start(ids, tokenizer), prefix)
-
-
-def response_start(ids: np.ndarray, tokenizer: WordTokenizer) -> int:
-    """The first token of the response: after the last `</think>` and the line breaks that follow it."""
-    start = int(np.flatnonzero(ids == tokenizer.id("</think>"))[-1]) + 1
-    while start < len(ids) and int(ids[start]) in tokenizer.line_breaks:
-        start += 1
-    return start
+    return Tokens(ids, kinds, rope_positions(kinds, cameras), len(prompt), prefix)
 
 
 def rope_positions(kinds: np.ndarray, cameras: Sequence[CameraTokens]) -> np.ndarray:

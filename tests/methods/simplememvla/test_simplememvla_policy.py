@@ -16,6 +16,7 @@ from mme_vla import UserError, build_policy
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
+from mme_vla.methods.simplememvla.prompt import CameraTokens, Robot, WordTokenizer, encode, instruction
 from mme_vla.methods.simplememvla.video import TEMPORAL
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_from_config
@@ -62,6 +63,16 @@ def observations(count: int, seed: int = 0) -> tuple[dict[str, np.ndarray], np.n
 
 def observe(episode: Any, views: dict[str, np.ndarray], states: np.ndarray, start: int, end: int) -> None:
     episode.observe({name: view[start:end] for name, view in views.items()}, states[start:end])
+
+
+@pytest.mark.parametrize("vocabulary", ["bytes", "words"])
+def test_a_prompt_has_the_same_tokens_with_a_response_as_alone(vocabulary: str) -> None:
+    tokenizer, cameras = WordTokenizer.load(vocabulary), [CameraTokens("front", (1, 1), [0.5])]
+    request = instruction("pick up the cube twice", Robot("arm", 20, 4), 1, 0)
+    alone, learned = (encode(tokenizer, cameras, request, response) for response in (None, "pick up the cube"))
+    assert alone.prompt == learned.prompt == len(alone.ids)
+    np.testing.assert_array_equal(learned.ids[: learned.prompt], alone.ids)
+    assert tokenizer.decode(learned.ids[learned.prompt :].tolist()) == "pick up the cube\n"
 
 
 def test_reading_ahead_changes_no_action() -> None:
