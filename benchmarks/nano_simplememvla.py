@@ -1,9 +1,9 @@
 """SimpleMemVLA at nano size, with its video or without, on one task by choices: demonstrations, then training.
 
-python benchmarks/nano_simplememvla.py record --folder data/move --count 120
-python benchmarks/nano_simplememvla.py train --folder data/move --count 120 --output outputs/video
-python benchmarks/nano_simplememvla.py train --folder data/move --count 120 --output outputs/no_video --no-video
-python benchmarks/nano_simplememvla.py measure --folder data/move --count 120 --output outputs/video/checkpoints/step_000400
+python benchmarks/nano_simplememvla.py record --folder data/pick
+python benchmarks/nano_simplememvla.py train --folder data/pick --output outputs/video
+python benchmarks/nano_simplememvla.py train --folder data/pick --output outputs/no_video --no-video
+python benchmarks/nano_simplememvla.py measure --folder data/pick --output outputs/video/checkpoints/step_000900
 
 Frames are rendered only at decisions and where the video shows them. `mme-vla evaluate checkpoint=…` evaluates.
 """
@@ -135,18 +135,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("command", choices=("record", "train", "measure"))
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--task", default="MoveCube")
-    parser.add_argument("--count", type=int, default=70)
+    parser.add_argument("--task", default="PickXtimes")
+    parser.add_argument("--count", type=int, default=110)
     parser.add_argument("--output", type=Path, help="of train: a run folder; of measure: a checkpoint")
     parser.add_argument("--no-video", action="store_true")
-    parser.add_argument("overrides", nargs="*", help="train.steps=400 …")
+    parser.add_argument("overrides", nargs="*", help="train.steps=300 …")
     args = parser.parse_intermixed_args()
     files = record(args.task, args.folder, args.count)
     if args.command == "measure":
         measure(files, args.output)
     elif args.command == "train":
         video = f"processor.video={'false' if args.no_video else 'true'}"
-        train(files, args.output, [video, "train.steps=400", "train.batch_size=16", *args.overrides])
+        train(files, args.output, [video, "train.steps=900", "train.batch_size=16", *args.overrides])
 
 
 if __name__ == "__main__":

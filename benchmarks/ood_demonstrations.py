@@ -78,6 +78,8 @@ def jobs(split: str) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
 
 def measure(split: str, path: Path) -> None:
     """Run what the file lacks."""
+    if split == "train" and not LENGTHS.is_file():
+        raise SystemExit(f"There is no {LENGTHS}: MME_VLA_LENGTHS names the file with the official lengths.")
     done = {(row["split"], row["task"], int(row["episode"])) for row in read(path)}
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, FIELDS)
