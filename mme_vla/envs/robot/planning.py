@@ -132,13 +132,11 @@ def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: fl
     return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / CONTROL_STEP))))
 
 
-def goal_in_base(
-    base_pose: sapien.Pose, target_pose: sapien.Pose, precision: type[np.floating[Any]] = np.float64
-) -> np.ndarray:
+def goal_in_base(base_pose: sapien.Pose, target_pose: sapien.Pose, precision: type[np.floating[Any]]) -> np.ndarray:
     """A pose in the world as a matrix [4, 4] in the base's frame, rounded as by `mplib` with NumPy 1.
 
-    It divides by the quaternion's squared length, summed in the pose's own precision. In single precision the rest is
-    up to 1e-7, which a rotation must not have: the tool is turned by up to 1e-9.
+    The rotation is divided by the quaternion's squared length, summed in `precision`. In single precision this length
+    is off by up to 1e-7, and the goal is turned by up to 1e-9.
     """
     w, x, y, z = np.asarray(target_pose.q, precision)
     summed, exact = (w * w + x * x + y * y + z * z), np.square(target_pose.q, dtype=np.float64).sum()
