@@ -20,7 +20,8 @@ from mme_vla.backbone.layers import AdaRMSNorm, Block, RMSNorm, additive_mask, a
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower
 from mme_vla.backbone.pi05 import initialise
 from mme_vla.backbone.pointer import Pointer
-from mme_vla.backbone.tower import PlaceTower, TowerConfig, load_shipped
+from mme_vla.backbone.tower import CLASSES as OBJECT_CLASSES
+from mme_vla.backbone.tower import PlaceTower, TowerConfig, by_class, load_shipped
 from mme_vla.errors import check_choice, check_multiple, require
 from mme_vla.registry import BACKBONES
 from mme_vla.speed import Recompute, Recomputes
@@ -53,8 +54,9 @@ class NanoConfig:
         check_positive(self, "backbone.")
         check_choice("backbone.goal", self.goal, ("text", "swap"))
         require(
-            self.goal == "text" or self.vision.layout == "segments",
-            f"backbone.vision.layout={self.vision.layout}: backbone.goal=swap needs segments; use backbone.goal=text.",
+            (self.goal == "swap") == (self.vision.layout == "segments"),
+            f"backbone.goal={self.goal}: backbone.vision.layout={self.vision.layout} needs "
+            f"{'swap' if self.vision.layout == 'segments' else 'text'}.",
         )
         check_choice("backbone.point", self.point, ("objects", "regression"))
         require(
@@ -129,22 +131,28 @@ class Reader(nn.Module):
 
 
 class GoalReader(nn.Module):
-    """Reads the goal as text: learned queries attend to its words, and what they read weighs vision tokens.
+    """Reads the goal as text: learned queries attend to its words, and what each reads selects classes of objects.
 
-    A product of goal and token is what it takes to find the object that a goal names among all that a token shows.
+    Features of the selected classes always have the same place in a token. So what is learned of the object that a goal
+    names holds for objects of every class.
     """
 
-    def __init__(self, config: NanoConfig, token_width: int) -> None:
+    def __init__(self, config: NanoConfig) -> None:
         super().__init__()
         width = config.vlm.width
         self.queries = nn.Linear(width, GOAL_QUERIES, bias=False)
-        self.weigh = nn.Linear(GOAL_QUERIES * width, token_width)
+        self.classes = nn.Linear(width, len(OBJECT_CLASSES))
         self.condition = nn.Linear(GOAL_QUERIES * width, config.action.width)
 
     def forward(self, words: Tensor, mask: Tensor) -> Tensor:
-        """What the queries read [b, q·d] of words [b, l, d]."""
+        """What the queries read [b, q, d] of words [b, l, d]."""
         scores = self.queries(words).masked_fill(~mask[..., None], torch.finfo(words.dtype).min)
-        return torch.einsum("blq,bld->bqd", scores.softmax(1), words).flatten(1)
+        return torch.einsum("blq,bld->bqd", scores.softmax(1), words)
+
+    def select(self, words: Tensor, mask: Tensor) -> Tensor:
+        """The share of each class in what a query selects [b, q, K]; those of a query add up to 1."""
+        selected: Tensor = self.classes(self(words, mask)).softmax(-1)
+        return selected
 
 
 class Column(nn.Module):
@@ -164,14 +172,15 @@ class Column(nn.Module):
 class Context(NamedTuple):
     """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d].
 
-    seen: tokens of the first view [b, n, D] to point at; None without a pointer.
+    pointing: what the pointer reads: tokens of the first view [b, n, D], and the share of each class in what the goal
+    selects [b, q, K]. None without a pointer.
     """
 
     keys_values: Tensor
     mask: Tensor
     condition: Tensor
     hook: Hook | None
-    seen: Tensor | None
+    pointing: tuple[Tensor, Tensor] | None
 
 
 @BACKBONES.register("nano")
@@ -204,7 +213,9 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         # The tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
         sizes = tower.widths, tower.blocks
         self.vision = PlaceTower(*sizes) if tower.layout == "places" else ConvTower(*sizes, width)
-        self.vision_width = self.vision.token_width
+        self.goal_reader = GoalReader(config) if config.goal == "text" else None
+        self.spare = 0 if self.goal_reader is None else GOAL_QUERIES * self.vision.token_width // len(OBJECT_CLASSES)
+        self.vision_width = self.vision.token_width + self.spare
         initialise(self.vision)
         if tower.pretrained and self.vision.out.weight.device.type != "meta":
             load_shipped(self.vision, tower.layout)
@@ -215,7 +226,6 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         self.embedding = nn.Embedding(config.vocab_size, width)
         self.positions = nn.Embedding(MAX_WORDS, width)
         self.prompt_in = nn.Sequential(nn.Linear(width, action_width), nn.GELU(), nn.Linear(action_width, action_width))
-        self.goal_reader = GoalReader(config, self.vision_width) if config.goal == "text" else None
         self.state_in = nn.Linear(2 * len(STATE_FREQUENCIES) * config.state_dim, action_width)
         self.time_in = nn.Sequential(
             nn.Linear(action_width, action_width), nn.SiLU(), nn.Linear(action_width, action_width)
@@ -233,7 +243,8 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         if self.goal_reader is not None:
             with torch.no_grad():
                 self.goal_reader.queries.weight.mul_(SHARPNESS)
-        self.pointer = Pointer(action_width, width) if config.point == "objects" else None  # has its own fresh weights
+        # The pointer has its own fresh weights.
+        self.pointer = Pointer(action_width, width, GOAL_QUERIES) if config.point == "objects" else None
         self.make_head(config)
         require(
             self.pointer is None or (isinstance(self.head, ChoiceHead) and len(self.head.numbers) == 2),
@@ -252,22 +263,26 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             module.compile(**options)
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 64, d]; no graph is kept while the tower is frozen."""
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 64, d]; no graph is kept while the tower is frozen.
+
+        The last `spare` numbers are 0 until `condition_on_prompt` fills them.
+        """
         frozen = not any(p.requires_grad for p in self.vision.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
-            tokens: Tensor = self.vision(images)
-            return tokens
+            return nn.functional.pad(self.vision(images), (0, self.spare))
 
     def condition_on_prompt(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
         """Vision tokens [b, …, d] as they are read with a prompt.
 
-        With `goal=text` each of their numbers is weighed by what `GoalReader` reads. `goal=swap` is of policies of
-        earlier versions: the class of cubes that the prompt names first and the first class are exchanged, so that one
-        index holds the requested one; `ConvTower.words`, part of the tower's weights, says which word names which.
+        With `goal=text` their last numbers are the features of the classes that each query of `GoalReader` selects.
+        `goal=swap` is of policies of earlier versions: the class of cubes that the prompt names first and the first
+        class are exchanged, so that one index holds the requested one; `ConvTower.words`, part of the tower's weights,
+        says which word names which.
         """
         if self.goal_reader is not None:
-            weights = self.goal_reader.weigh(self.goal_reader(self._words(prompt), prompt_mask)).to(tokens.dtype)
-            return tokens * (1 + weights.view(len(prompt), *[1] * (tokens.ndim - 2), -1))
+            selected = self.goal_reader.select(self._words(prompt), prompt_mask).to(tokens.dtype)
+            features = torch.einsum("bqk,b...kf->b...qf", selected, by_class(tokens[..., : -self.spare]))
+            return torch.cat([tokens[..., : -self.spare], features.flatten(-2)], -1)
         assert isinstance(self.vision, ConvTower)  # as `NanoConfig` says
         named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
         places = torch.where(named.any(1), named.int().argmax(1), prompt.shape[1])
@@ -349,11 +364,14 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         words = self.prompt_in(prompt.tokens) * batch.prompt_mask[..., None]
         condition = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
         if self.goal_reader is not None:
-            condition = condition + self.goal_reader.condition(self.goal_reader(prompt.tokens, prompt.mask))
+            condition = condition + self.goal_reader.condition(self.goal_reader(prompt.tokens, prompt.mask).flatten(1))
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
-        seen = None if self.pointer is None else self._view_tokens(batch, 1)[:, 0]
-        return Context(keys_values, mask, condition, injection.hook, seen)
+        pointing = None
+        if self.pointer is not None:
+            assert self.goal_reader is not None  # `NanoConfig` says so
+            pointing = self._view_tokens(batch, 1)[:, 0], self.goal_reader.select(prompt.tokens, prompt.mask)
+        return Context(keys_values, mask, condition, injection.hook, pointing)
 
     def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
         """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]; behind them what points."""
@@ -365,8 +383,9 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         x = self.final(x)[0]
         output: Tensor = self.action_out(x)
         if self.pointer is not None:
-            assert context.seen is not None
-            output = torch.cat([output, self.pointer(x, context.seen.repeat_interleave(versions, 0))], -1)
+            assert context.pointing is not None
+            read = (part.repeat_interleave(versions, 0) for part in context.pointing)
+            output = torch.cat([output, self.pointer(x, *read)], -1)
         return output.float()
 
     def recompute(self, mode: Recompute) -> None:

@@ -18,13 +18,14 @@ class Pointer(nn.Module):
     several.
 
     Args:
-        action_width: of an action token. width: of queries and keys.
+        action_width: of an action token. width: of queries and keys. goals: q, queries that select classes by the goal.
     """
 
-    def __init__(self, action_width: int, width: int) -> None:
+    def __init__(self, action_width: int, width: int, goals: int) -> None:
         super().__init__()
         self.query = nn.Linear(action_width, width)
         self.classes = nn.Embedding(len(CLASSES), width)
+        self.selected = nn.Linear(goals, width, bias=False)
         self.near = nn.Linear(WAVES**2, width, bias=False)
         self.visible = nn.Parameter(torch.ones(()))
         self.point = nn.Linear(2, 2)
@@ -32,14 +33,16 @@ class Pointer(nn.Module):
             self.point.weight.copy_(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))  # a point is row and column
             self.point.bias.zero_()
 
-    def forward(self, actions: Tensor, tokens: Tensor) -> Tensor:
+    def forward(self, actions: Tensor, tokens: Tensor, selected: Tensor) -> Tensor:
         """Logits of m = n·K components, then their points, [b, h, 3·m].
 
         Args:
-            actions: [b, h, d]. tokens: of the tower, [b, n, 20·K].
+            actions: [b, h, d]. tokens: of the tower, [b, n, ≥ 20·K]. selected: share of each class in what the goal
+                selects, [b, q, K].
         """
         presence, where = located(tokens.to(self.near.weight.dtype))
-        keys = (self.classes.weight + self.near(place_waves(where))).flatten(1, 2)
+        classes = self.classes.weight + self.selected(selected.transpose(1, 2))  # b k w
+        keys = (classes[:, None] + self.near(place_waves(where))).flatten(1, 2)
         logits = self.query(actions) @ keys.transpose(1, 2) / math.sqrt(keys.shape[-1])
         logits = logits + (self.visible * (presence + ABSENT).log()).flatten(1)[:, None]
         points = self.point(where).flatten(1)[:, None]

@@ -194,6 +194,12 @@ def located(tokens: Tensor) -> tuple[Tensor, Tensor]:
     return presence.clamp(0, 1), where.clamp(-1, 1)
 
 
+def by_class(tokens: Tensor) -> Tensor:
+    """The features of each class [..., K, 20] in tokens [..., 20·K] of `PlaceTower`."""
+    first = tokens[..., : 4 * len(CLASSES)].unflatten(-1, (4, len(CLASSES))).transpose(-2, -1)
+    return torch.cat([first, tokens[..., 4 * len(CLASSES) :].unflatten(-1, (len(CLASSES), -1))], -1)
+
+
 def place_waves(where: Tensor) -> Tensor:
     """cos(πi·c)·cos(πj·r) of places [..., 2], i and j from 0 to 3: [..., 16], as a token's waves are of one object."""
     orders = torch.arange(WAVES, device=where.device, dtype=where.dtype) * math.pi

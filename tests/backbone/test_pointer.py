@@ -30,7 +30,7 @@ def test_tokens_say_where_an_object_is() -> None:
 
 def test_a_pointer_that_learned_a_class_at_some_places_finds_it_at_others() -> None:
     torch.manual_seed(0)
-    pointer, asked = Pointer(8, 32), torch.ones(1, 1, 8)
+    pointer, asked, selected = Pointer(8, 32, 2), torch.ones(1, 1, 8), torch.zeros(1, 2, len(CLASSES))
     head = ChoiceHead(horizon=1, action_dim=3, choice=[0])
     optimizer = torch.optim.Adam(pointer.parameters(), 1e-2)
     places = torch.rand(8, 4).tolist()
@@ -44,14 +44,14 @@ def test_a_pointer_that_learned_a_class_at_some_places_finds_it_at_others() -> N
     for _ in range(40):
         for tokens, target in scenes:
             optimizer.zero_grad()
-            output = torch.cat([torch.zeros(1, 1, 3), pointer(asked, tokens)], -1)
+            output = torch.cat([torch.zeros(1, 1, 3), pointer(asked, tokens, selected)], -1)
             head.loss(
                 lambda x, time, output=output: output, target, head.training_noise(1, torch.Generator())
             ).backward()
             optimizer.step()
     for place in torch.rand(6, 4).tolist():
         tokens, target = scene(place)
-        output = torch.cat([torch.zeros(1, 1, 3), pointer(asked, tokens)], -1)
+        output = torch.cat([torch.zeros(1, 1, 3), pointer(asked, tokens, selected)], -1)
         chunk = head.sample(lambda x, index, output=output: output, torch.zeros(1, 1, 3), 1)
         assert (chunk - target)[..., 1:].abs().max() < 0.1
 
