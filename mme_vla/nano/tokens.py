@@ -164,7 +164,9 @@ class TokenStore:
         with safe_open(path, "pt") as tensors:
             scored = {name.removeprefix("scores/") for name in tensors.keys() if name.startswith("scores/")}  # noqa: SIM118
             required = {_memory(text).storage.scorer for text in self.memories}
-            return bool(tensors.metadata().get("stamp") == stamp) and required <= scored
+            widths = {tensors.get_slice(name).get_shape()[-1] for name in tensors.keys() if name.startswith("tokens/")}  # noqa: SIM118
+            complete = widths == {_policy(self.config).backbone.vision_width} and required <= scored
+            return bool(tensors.metadata().get("stamp") == stamp) and complete
 
 
 @cache
