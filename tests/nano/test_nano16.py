@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
+from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
@@ -20,6 +21,7 @@ from mme_vla.nano import evaluating
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.evaluating import Rules, built_scenes, frequent_moves, play_all
 from mme_vla.nano.learning import Decisions, choice_errors, statistics
+from mme_vla.nano.runs import compose_rows
 from mme_vla.policy.mme import MMEPolicy
 
 
@@ -53,6 +55,22 @@ def test_present_gives_the_current_frame_and_as_many_parameters_as_a_memory() ->
     present.require_processor().stats = statistics([made], present)
     history = Decisions.of(present, [made]).batch.history
     assert history is not None and history.positions[:, :, 0].float().std(1).max() == 0
+
+
+def test_all_memories_read_decisions_and_the_same_frames() -> None:
+    rows = compose_rows(resolved(compose("nano", ["nano=nano16"])))
+    decisions = np.array([66, 71, 140, 333, 640, 1201])
+    stored, every = {0, *range(15, 1300, 16)}, set[int]()
+    for choice in rows.choices:
+        read = choice.read(decisions, 66)
+        assert read <= stored | set(decisions.tolist()), choice.memory
+        every |= read
+    assert {choice.memory["name"] for choice in rows.choices if choice.memory} == {
+        "framesamp", "tokendrop", "ttt", "rmt", "present", "retrieval", "gist", "moment", "actions", "learned_topk",
+        "anchors", "events", "pyramid", "keyframes",
+    }  # fmt: skip
+    of_one = compose_rows(resolved(compose("nano", ["nano=nano16", "with_memory=framesamp_modul", "also=[]"])))
+    assert every == set().union(*(choice.read(decisions, 66) for choice in of_one.choices)), "later rows render none"
 
 
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
