@@ -27,8 +27,8 @@ VARIANTS = [
     method.model for method in paper_methods().values()
     if method.model and (method.family in ("perceptual", "recurrent") or method.subgoal == "oracle")
 ]  # fmt: skip
-EXPECTED = ["demonstrator", *VARIANTS, "pi05", MATCHED, "frequent", "random"]
-"""The rows of the benchmark: ceiling, the paper's variants, floors."""
+EXPECTED = ["demonstrator", "oracle_frames", *VARIANTS, "pi05", MATCHED, "frequent", "random"]
+"""The rows of the benchmark: ceilings, the paper's variants, floors."""
 
 
 def add(folder: Path) -> None:

@@ -48,7 +48,7 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
 def alone(words: Sequence[str]) -> list[str]:
     """Words for the models that they name and no other rows, with one training each if they do not say otherwise."""
     typed = {word.partition("=")[0] for word in words}
-    others = ("beside=[]", "planner=false", "floors=false", "trainings=1")
+    others = ("beside=[]", "planner=false", "oracle=null", "floors=false", "trainings=1")
     return [*words, *(word for word in others if word.partition("=")[0] not in typed)]
 
 

@@ -153,6 +153,7 @@ def evaluate_all(
     from mme_vla.nano.evaluating import (
         DEMONSTRATOR,
         FREQUENT,
+        ORACLE_FRAMES,
         PLANNER,
         RANDOM,
         evaluate_row,
@@ -164,10 +165,13 @@ def evaluate_all(
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
         selected = episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
-        records[row] = []
-        for job in of_row:
-            place = folder / row / str(job.config["seed"])
-            records[row] += evaluate_row(job.folder, job.checkpoint, place, selected, rules)
+        model, at, budget = row.partition("@")
+        oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == config["oracle"] else None
+        for name in [row] if oracle is None else [row, oracle]:
+            records[name] = []
+            for job in of_row:
+                place, ceiling = folder / name / str(job.config["seed"]), None if name == row else oracle
+                records[name] += evaluate_row(job.folder, job.checkpoint, place, selected, rules, ceiling)
     if config["shard"] is None:
         by_choice = bool(robot.action.choice)
         moves = frequent_moves(files, robot.action) if by_choice else {}

@@ -330,7 +330,7 @@ def test_a_model_is_trained_before_the_board_is_made(
     monkeypatch.setattr(board_command, "SHIPPED", tmp_path / "none")
     words = ["task=VideoUnmask", "model=mine_modul", f"split={SPLIT}", f"output={tmp_path}", "beside=[pi05]"]
     board_command.main([*words, "--samples", "50"], train, nano_command.with_settings)
-    assert typed == [[*words, "planner=false", "floors=false", "trainings=1"]]
+    assert typed == [[*words, "planner=false", "oracle=null", "floors=false", "trainings=1"]]
     assert "mine_modul: place 1 of 1" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         board_command.main([f"split={SPLIT}"], train, nano_command.with_settings)

@@ -21,6 +21,7 @@ from mme_vla.nano import evaluating
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.evaluating import Rules, built_scenes, frequent_moves, play_all
 from mme_vla.nano.learning import Decisions, choice_errors, statistics
+from mme_vla.nano.rows import read_rows
 from mme_vla.nano.runs import compose_rows
 from mme_vla.policy.mme import MMEPolicy
 
@@ -170,7 +171,9 @@ def test_the_command_learns_two_tasks_and_continues_in_a_fresh_process(tmp_path:
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     rows = {path.parent.parent.name: json.loads(path.read_text()) for path in tmp_path.glob("val/*/*/trained.json")}
-    assert set(rows) == {"framesamp_modul", "pi05", "demonstrator", "random", "frequent"}
+    assert set(rows) == {"framesamp_modul", "oracle_frames", "pi05", "demonstrator", "random", "frequent"}
+    oracle = {**rows["framesamp_modul"], "row": "oracle_frames", "kind": "ceiling"}
+    assert rows["oracle_frames"] == oracle and len(read_rows([tmp_path / "val"])) == 6
     assert rows["pi05"]["demonstrations"] == {"StopCube": 2, "MoveCube": 2} and rows["pi05"]["val_loss"] > 0
     for row in tmp_path.glob("val/*/0"):
         assert len((row / "episodes.jsonl").read_text().splitlines()) == 2, row
