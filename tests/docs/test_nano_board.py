@@ -35,4 +35,11 @@ def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch:
     text = nano_board.block(board)
     assert "| framesamp_modul | 1 [1, 1] | 2 | 83.33 ± 23.57 |" in text and "Not run yet: `demonstrator`" in text
     assert "`framesamp_modul`" not in text.partition("Not run yet")[2]
-    assert "### Success by task (%)" in nano_board.evidence([board])
+    write_training(tmp_path / "motions", "framesamp_modul", 0, 1, action_space="waypoint")
+    nano_board.add(tmp_path / "motions")
+    assert (tmp_path / "rows" / "further-waypoint" / "framesamp_modul" / "0" / "trained.json").is_file()
+    both = nano_board.boards()
+    assert [made.action_space for made in both] == ["multi_choice", "waypoint"]
+    page = nano_board.evidence(both)
+    assert page.count("### Success by task (%)") == 2 and "## Split `further`, `waypoint`" in page
+    assert nano_board.block(both[0]) == text

@@ -74,6 +74,13 @@ def test_all_memories_read_decisions_and_the_same_frames() -> None:
     assert every == set().union(*(choice.read(decisions, 66) for choice in of_one.choices)), "later rows render none"
 
 
+def test_planned_motions_of_several_tasks_are_one_run() -> None:
+    config = resolved(compose("nano", ["nano=motions"]))
+    rows = compose_rows(config)
+    assert rows.robot.action.answers == "waypoint" and rows.blind == "pi05" and len(config["task"]) == 5
+    assert {each["backbone"]["name"] for each in rows.composed.values()} == {"nano"}
+
+
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
     blind, demonstrations = policy("pi05").eval(), [demonstration_of("abb"), demonstration_of("ab", "BinFill")]
     blind.require_processor().stats = statistics(demonstrations, blind)
