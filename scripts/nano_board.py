@@ -33,7 +33,6 @@ EXPECTED = ["demonstrator", "oracle_frames", *VARIANTS, "pi05", MATCHED, "freque
 
 def add(folder: Path) -> None:
     """Copy the rows of a run's split into the folder of their table, checked, with compressed records."""
-    table = None
     for place in sorted(path.parent for path in folder.rglob("trained.json")):
         training = read_training(place)
         table = ROWS / training.table
@@ -43,9 +42,9 @@ def add(folder: Path) -> None:
             shutil.copyfile(place / name, target / name)
         lines = b"".join(path.read_bytes() for path in sorted(place.glob("episodes*.jsonl")))
         (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
+        if (scenes := place.parents[1] / SCENES).is_file():
+            shutil.copyfile(scenes, table / SCENES)
         print(f"added {target.relative_to(ROOT)}")
-    if table and (folder / SCENES).is_file():
-        shutil.copyfile(folder / SCENES, table / SCENES)
 
 
 def boards() -> list[Board]:
@@ -102,7 +101,9 @@ def _names(names: list[str]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--add", type=Path, help="folder <output>/<split> of a run whose rows are copied first")
+    parser.add_argument(
+        "--add", type=Path, help="folder <output>/<split> of a run, or a row in it, to copy first"
+    )
     args = parser.parse_args()
     if args.add:
         add(args.add)

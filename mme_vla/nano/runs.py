@@ -1,6 +1,7 @@
 """A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as it is not there."""
 
 import logging
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -312,25 +313,30 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     return [file for group in groups for file in group.files]
 
 
+def processor_seconds() -> float:
+    """Seconds of processors that this process and those of its processes that ended have used."""
+    return sum(os.times()[:4])
+
+
 class Minutes:
-    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors for this process."""
+    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors (`processor_seconds`)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     @property
     def spent(self) -> dict[str, list[float]]:
-        """Stage → minutes on the clock, and of this process; other runs of the command may add to them meanwhile."""
+        """Stage → minutes on the clock, and of processors; other runs of the command may add to them meanwhile."""
         return read_json(self._path, "minutes of a run") if self._path.is_file() else {}
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
         """Time what happens inside; a stage that had nothing to do counts its moment."""
-        begun = time.perf_counter(), time.process_time()
+        begun = time.perf_counter(), processor_seconds()
         try:
             yield
         finally:
-            now = time.perf_counter(), time.process_time()
+            now = time.perf_counter(), processor_seconds()
             spent = self.spent
             before = spent.get(stage, [0.0, 0.0])
             spent[stage] = [old + (b - a) / 60 for old, a, b in zip(before, begun, now, strict=True)]

@@ -6,6 +6,7 @@ import nano_board
 import pytest
 
 from helpers.nano_rows import TASKS, write_training
+from mme_vla.utils import write_json
 
 
 def test_the_pages_are_those_of_the_committed_rows() -> None:
@@ -30,6 +31,9 @@ def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch:
     for seed, won in enumerate((3, 2)):
         write_training(tmp_path / "run", "framesamp_modul", seed, won)
     write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
+    write_json(tmp_path / "run" / "scenes.json", {"split": "further", "tried": {f"{TASKS[0]} 0": ""}})
+    nano_board.add(tmp_path / "run" / "pi05")
+    assert [path.name for path in sorted((tmp_path / "rows" / "further").iterdir())] == ["pi05", "scenes.json"]
     nano_board.add(tmp_path / "run")
     (board,) = nano_board.boards()
     text = nano_board.block(board)

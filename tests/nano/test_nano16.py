@@ -68,7 +68,7 @@ def test_all_memories_read_decisions_and_the_same_frames() -> None:
         every |= read
     assert {choice.memory["name"] for choice in rows.choices if choice.memory} == {
         "framesamp", "tokendrop", "ttt", "rmt", "present", "retrieval", "gist", "moment", "actions", "learned_topk",
-        "anchors", "events", "pyramid", "keyframes",
+        "bank", "anchors", "events", "pyramid", "keyframes",
     }  # fmt: skip
     of_one = compose_rows(resolved(compose("nano", ["nano=nano16", "with_memory=framesamp_modul", "also=[]"])))
     assert every == set().union(*(choice.read(decisions, 66) for choice in of_one.choices)), "later rows render none"
