@@ -101,9 +101,7 @@ def _names(names: list[str]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--add", type=Path, help="folder <output>/<split> of a run, or a row in it, to copy first"
-    )
+    parser.add_argument("--add", type=Path, help="folder <output>/<split> of a run, or a row in it, to copy first")
     args = parser.parse_args()
     if args.add:
         add(args.add)
