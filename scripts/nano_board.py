@@ -15,7 +15,7 @@ from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.store import RECORDS
 from mme_vla.nano import board_page
 from mme_vla.nano.board import MATCHED, Board
-from mme_vla.nano.rows import FILES, SCENES, read_rows, read_training
+from mme_vla.nano.rows import CHOICES, FILES, SCENES, read_rows, read_training
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = ROOT / "benchmarks" / "nano16"
@@ -27,31 +27,31 @@ VARIANTS = [
     method.model for method in paper_methods().values()
     if method.model and (method.family in ("perceptual", "recurrent") or method.subgoal == "oracle")
 ]  # fmt: skip
-EXPECTED = ["demonstrator", *VARIANTS, "pi05", MATCHED, "frequent", "random"]
-"""The rows of the benchmark: ceiling, the paper's variants, floors."""
+EXPECTED = ["demonstrator", "oracle_frames", *VARIANTS, "pi05", MATCHED, "frequent", "random"]
+"""The rows of the benchmark: ceilings, the paper's variants, floors."""
 
 
 def add(folder: Path) -> None:
-    """Copy the rows of a run's split into the repository, checked, with compressed records."""
-    split = None
+    """Copy the rows of a run's split into the folder of their table, checked, with compressed records."""
     for place in sorted(path.parent for path in folder.rglob("trained.json")):
         training = read_training(place)
-        split = ROWS / training.records[0].split
-        target = split / training.facts.row / str(training.facts.seed)
+        table = ROWS / training.table
+        target = table / training.facts.row / str(training.facts.seed)
         target.mkdir(parents=True, exist_ok=True)
         for name in FILES:
             shutil.copyfile(place / name, target / name)
         lines = b"".join(path.read_bytes() for path in sorted(place.glob("episodes*.jsonl")))
         (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
+        if (scenes := place.parents[1] / SCENES).is_file():
+            shutil.copyfile(scenes, table / SCENES)
         print(f"added {target.relative_to(ROOT)}")
-    if split and (folder / SCENES).is_file():
-        shutil.copyfile(folder / SCENES, split / SCENES)
 
 
 def boards() -> list[Board]:
-    """A board for each split that has rows, the one with the most rows first."""
-    splits = sorted({path.parents[2] for path in ROWS.rglob("trained.json")})
-    return sorted((Board(read_rows([split])) for split in splits), key=lambda board: -len(board.rows))
+    """A board for each split and action space that has rows: those of choices first, then those with most rows."""
+    tables = sorted({path.parents[2] for path in ROWS.rglob("trained.json")})
+    made = [Board(read_rows([table])) for table in tables]
+    return sorted(made, key=lambda board: (board.action_space != CHOICES, -len(board.rows)))
 
 
 def block(board: Board | None) -> str:
@@ -78,7 +78,8 @@ def evidence(made: list[Board]) -> str:
     parts = [head] + ([] if made else ["Not run yet.\n"])
     for board in made:
         listed = [*board_page.notes(board), *board_page.separating(board)]
-        parts.append("\n".join([f"## Split `{board.split}`", "", *(f"- {line}" for line in listed), ""]))
+        actions = "" if board.action_space == CHOICES else f", `{board.action_space}`"
+        parts.append("\n".join([f"## Split `{board.split}`{actions}", "", *(f"- {line}" for line in listed), ""]))
         parts += [to_markdown(table) for table in board_page.all_tables(board) if table.rows]
     return "\n".join(parts)
 
@@ -90,7 +91,7 @@ def untitled(table: Table) -> str:
 
 def pages(made: list[Board]) -> dict[Path, str]:
     """The text of each page."""
-    text = block(made[0] if made else None)
+    text = block(next((board for board in made if board.action_space == CHOICES), None))
     return {PAGE: BLOCK.sub(lambda _: text, PAGE.read_text()), EVIDENCE: evidence(made)}
 
 
@@ -100,7 +101,7 @@ def _names(names: list[str]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--add", type=Path, help="folder <output>/<split> of a run whose rows are copied first")
+    parser.add_argument("--add", type=Path, help="folder <output>/<split> of a run, or a row in it, to copy first")
     args = parser.parse_args()
     if args.add:
         add(args.add)

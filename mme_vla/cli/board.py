@@ -48,7 +48,7 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
 def alone(words: Sequence[str]) -> list[str]:
     """Words for the models that they name and no other rows, with one training each if they do not say otherwise."""
     typed = {word.partition("=")[0] for word in words}
-    others = ("beside=[]", "planner=false", "floors=false", "trainings=1")
+    others = ("beside=[]", "planner=false", "oracle=null", "floors=false", "trainings=1")
     return [*words, *(word for word in others if word.partition("=")[0] not in typed)]
 
 
@@ -60,12 +60,15 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     from mme_vla.nano.rows import read_rows
 
     folders = [Path(word.removeprefix("rows=")) for word in args.words if word.startswith("rows=")]
-    rows = read_rows([SHIPPED / split] if (SHIPPED / split).is_dir() else [], local=[*folders, *trained])
+    local = read_rows([], local=[*folders, *trained])
+    shipped = SHIPPED / next((row[0].table for row in local.values()), split)
+    rows = read_rows([shipped], local=[*folders, *trained]) if shipped.is_dir() else local
     board = Board(rows, samples=args.samples or SAMPLES)
     pairs = board.neighbours()
     tables = [board_page.ranking(board, brief=True), board_page.targets(board)]
     for table in [*tables, *([comparison_table(pairs)] if pairs else [])]:
-        print_table(table, 120)
+        if table.rows:
+            print_table(table, 120)
     for line in [*board_page.notes(board), *board_page.separating(board), *board_page.standing(board)]:
         print(printable(line))
     if args.html:

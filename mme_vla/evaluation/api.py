@@ -44,7 +44,8 @@ def evaluate(
     needs nothing of the kind.
 
     Args:
-        policy: one with statistics; or what to load one from: a folder, a hub repository, or the shipped `nano`.
+        policy: one with statistics; or what to load one from: a folder, a hub repository, or the name of a
+            shipped one, such as `nano`.
         tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all of the split, a
             number for the first so many, or a list.
         seed: of the policy's noise.

@@ -16,6 +16,12 @@ def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
     return np.arange(step + 1) if step < count else np.linspace(0, step, count).astype(np.int64)
 
 
+def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> np.ndarray:
+    """At most `count` of the stored frames up to `step`, evenly spaced among them, both ends included."""
+    stored = storage.stored_frames(step + 1)
+    return stored[evenly_spaced_frames(len(stored) - 1, count)]
+
+
 def budget_frames(budget: int, grid: int, at_least: int = 1) -> int:
     """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole ones, and enough."""
     least = max(budget // grid**2, at_least) * grid**2
@@ -58,5 +64,4 @@ class FrameSamp(PerceptualMemory):
 
     def selected_frames(self, step: int) -> np.ndarray:
         """The frames remembered at `step`: evenly spaced among those that are stored."""
-        stored = self.storage.stored_frames(step + 1)
-        return stored[evenly_spaced_frames(len(stored) - 1, self.frames)]
+        return evenly_spaced_stored_frames(self.storage, step, self.frames)

@@ -6,7 +6,7 @@ frame by frame, which `encode` uses while an episode's frame list grows.
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -32,7 +32,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 def recurrent_frames(
-    step: int, exec_start: int, max_steps: int = 64, max_video: int = 40, stride: int = 16
+    step: int, exec_start: int, max_steps: int = 64, max_video: int = 40, stride: int = 16, every: int = 1
 ) -> np.ndarray:
     """Frames read at `step`, ascending and ending with `step`; at most `max_steps`, the earliest dropped first.
 
@@ -43,13 +43,27 @@ def recurrent_frames(
     Args:
         step: the current frame. exec_start: the first execution frame (0 without video). While the video still runs,
             all frames before the current one count as video, so a finished episode and a running one agree.
+        every: above 1 all this counts the frames 0 and k·every − 1 alone, and `step` comes after the newest of them.
+            Two steps then read the same past frames, which demonstrations and episodes render once.
 
     Returns:
         int64 [n].
     """
-    start = min(exec_start, step)
-    execution = np.arange(start + (step - start) % stride, step + 1, stride)
-    return np.concatenate([video_frames(start, max_video, stride), execution])[-max_steps:]
+    frames = np.union1d([0], np.arange(every - 1, step + 1, every))
+    last, apart = len(frames) - 1, stride // every
+    start = min(int(np.searchsorted(frames, exec_start)), last)
+    execution = np.arange(start + (last - start) % apart, last + 1, apart)
+    past = frames[np.concatenate([video_frames(start, max_video, apart), execution])]
+    return np.union1d(past, [step])[-max_steps:]
+
+
+def check_every(every: int, stride: int, name: str = "stride") -> None:
+    """Raise `UserError` unless frames `stride` apart are among every so many; name: the key of `stride`."""
+    check_sizes("memory", every=every)
+    require(
+        stride % every == 0,
+        f"memory.{name}={stride} must be a multiple of memory.every={every}, such as {-(-stride // every) * every}.",
+    )
 
 
 def video_frames(length: int, max_video: int, stride: int) -> np.ndarray:
@@ -181,6 +195,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         max_steps: int = 64,
         max_video: int = 40,
         stride: int = 16,
+        every: int = 1,
         jitter: int = 0,
         chunk: int = 8,
         position_dim: int | None = None,
@@ -194,7 +209,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
             layer: the recurrence, at width `hidden`.
             budget: memory tokens handed over.
             grid, pooling: a remembered frame is grid×grid tokens.
-            max_steps, max_video, stride: see `recurrent_frames`.
+            max_steps, max_video, stride, every: see `recurrent_frames`.
             jitter: in training, past frames move at random by up to this many frames, if the data hand over
                 randomness (`data.jitter`).
             chunk: frames that are recomputed together in the backward pass; windows are padded to a multiple of it.
@@ -203,10 +218,16 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         """
         super().__init__()
         check_sizes("memory", max_steps=max_steps, max_video=max_video, stride=stride, chunk=chunk)
+        check_every(every, stride)
         require(0 <= 2 * jitter < stride, f"memory.jitter={jitter} must be less than half of memory.stride={stride}.")
+        require(
+            every == 1 or not jitter,
+            f"memory.jitter={jitter} moves frames away from those of memory.every={every}: set memory.jitter=0 or "
+            "memory.every=1.",
+        )
         self.budget, self.capacity = budget, max_steps * grid**2
         self.storage = StorageSpec(grid, pooling)
-        self.max_steps, self.max_video, self.stride = max_steps, max_video, stride
+        self.max_steps, self.max_video, self.stride, self.every = max_steps, max_video, stride, every
         self.jitter, self.chunk = jitter, chunk
         self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden, positions)
         self.layer = layer
@@ -219,11 +240,12 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
 
     def frames(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """Frames read at `step`, ascending; the last is `step`."""
-        frames = recurrent_frames(step, history.exec_start, self.max_steps, self.max_video, self.stride)
+        limits = (self.max_steps, self.max_video, self.stride, self.every)
+        frames = recurrent_frames(step, history.exec_start, *limits)
         return frames if rng is None or not self.jitter else jittered(frames, history.exec_start, self.jitter, rng)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        limits = (self.max_steps, self.max_video, self.stride)
+        limits = (self.max_steps, self.max_video, self.stride, self.every)
         return union_frames([recurrent_frames(int(step), exec_start, *limits) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -305,25 +327,28 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
 
         While an episode's frame list extends one that its stream has taken, only the new frames enter. Where it does
         not (replans at an uneven pace, or a list that lost its first frames and was not prepared), a fresh state takes
-        the whole list. Episodes with equally many new frames go through the layer together.
+        the whole list. A current frame that no later list has (`every`) enters a copy of the stream's state. Episodes
+        with equally many new frames go through the layer together.
         """
-        pending: dict[int, list[tuple[History, Taken, np.ndarray]]] = defaultdict(list)
-        continued = []
-        for history, stream in zip(histories, streams, strict=True):
+        pending: dict[int, list[int]] = defaultdict(list)
+        states, entering = [], []
+        for i, (history, stream) in enumerate(zip(histories, streams, strict=True)):
             step = len(history) - 1
             stream.decides(step)
             frames = self.frames(history, step)
-            taken = stream.continued(frames)
-            new = frames[len(taken.frames) :]
-            pending[len(new)].append((history, taken, new))
-            stream.updates += len(new)
-            continued.append(taken)
+            states.append(stream.continued(frames))
+            entering.append(frames[len(states[i].frames) :])
+            pending[len(entering[i])].append(i)
+            stream.updates += len(entering[i])
         for count, group in pending.items():
             at = 0
             for size in pieces(count, self.chunk):
-                self._enter([(history, taken, new[at : at + size]) for history, taken, new in group])
+                if at == count - 1:
+                    for i in group:
+                        states[i] = states[i] if len(histories[i]) % self.every == 0 else replace(states[i])
+                self._enter([(histories[i], states[i], entering[i][at : at + size]) for i in group])
                 at += size
-        return self.read(_stack([taken.state or self.init_state(1) for taken in continued]))
+        return self.read(_stack([taken.state or self.init_state(1) for taken in states]))
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Let a chunk of frames enter that the next decision's list has before its newest one.

@@ -17,7 +17,7 @@ from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggre
 from mme_vla.evaluation.results.compare import Comparison, compare, compare_all, holm
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
-from mme_vla.nano.rows import Trained, Training
+from mme_vla.nano.rows import CHOICES, Trained, Training
 
 SAMPLES = 2000
 """Of the bootstrap."""
@@ -124,7 +124,7 @@ class Board:
         counts = {sum(key.task == task for key in scenes) for task in tasks}
         require(len(counts) == 1, f"Tasks have {sorted(counts)} scenes: a board has as many of each task.")
         self.protocol = Protocol(tuple(tasks), counts.pop(), samples=samples)
-        self.split = next(iter(scenes.values()))[0]
+        self.split, self.action_space = next(iter(scenes.values()))[0], next(iter(rows.values()))[0].action_space
         made = [_row(name, trainings, self.protocol) for name, trainings in rows.items()]
         self.rows = sorted(made, key=lambda row: -self.success(row))
 
@@ -231,7 +231,9 @@ class Board:
         return made
 
     def targets(self) -> list[Target]:
-        """What the best policy is to reach, and its advantage over the floor of as many parameters."""
+        """What the best policy is to reach by choices, and its advantage over the floor of as many parameters."""
+        if self.action_space != CHOICES:
+            return []
         names = ("best memory solves at least 60 % of all episodes", f"{MATCHED} solves at most half of that")
         best, matched = next(iter(self.of_kind("policy")), None), [row for row in self.rows if row.name == MATCHED]
         if best is None:
@@ -239,7 +241,7 @@ class Board:
         low, high = percentiles(self.draws([best], self.protocol.tasks)[0])
         success = self.success(best)
         first = Target(names[0], f"{success:.1f} % ({best.name})", f"[{low:.1f}, {high:.1f}]", reached=success >= 60)
-        if not matched:
+        if not matched or not success:
             return [first, Target(names[1])]
         ratios = np.divide(*self.draws([matched[0], best], self.protocol.tasks))
         share, (low, high) = self.success(matched[0]) / success, percentiles(ratios)

@@ -7,6 +7,7 @@ from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, show, span
 from mme_vla.nano.board import Board, Row, published_success
+from mme_vla.nano.rows import CHOICES
 
 PAINT = {"policy": COLOURS[0], "floor": FAINT, "ceiling": COLOURS[2]}
 LOCAL = COLOURS[1]
@@ -108,9 +109,10 @@ def targets(board: Board) -> Table:
 def notes(board: Board) -> list[str]:
     """What a reader of the tables has to know."""
     noise, single = board.noise(), [row for row in board.ranked if row.facts.trained and len(row.method.trainings) == 1]
+    actions = "" if board.action_space == CHOICES else f" Actions are `{board.action_space}`, not choices."
     lines = [
         f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split `{board.split}`, the same for "
-        "all rows."
+        f"all rows.{actions}"
     ]
     if noise is None:
         lines.append("No row has two trainings: the noise between trainings is unknown, and intervals are too narrow.")
@@ -206,7 +208,7 @@ def page(board: Board) -> str:
     ranks, aims, pairs, by_task, differ, beside, agree = all_tables(board)
     sections = [
         Section("Ranking", success_figure(board), [ranks], paragraphs=notes(board)),
-        Section("Targets", tables=[aims]),
+        *([Section("Targets", tables=[aims])] if aims.rows else []),
         Section("Neighbours", tables=[pairs], caption="P values are corrected by Holm for the number of pairs."),
         Section("Tasks", tables=[by_task]),
         Section("Do memories differ?", budget_figure(board), [differ], paragraphs=separating(board)),

@@ -25,12 +25,19 @@ from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.fitting import DONE, ROW_CONFIG
 from mme_vla.play.game import MAX_CHOICES, ChoiceSession, EpisodeId
 from mme_vla.play.players import OraclePlayer, Player, RandomPlayer, play
+from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.probing.arms import lacking, read_arm
+from mme_vla.probing.channels import channel_of
+from mme_vla.probing.probed import ProbedPolicy
+from mme_vla.probing.run import named
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import build_predictor
 from mme_vla.utils import read_json, write_json
 
 PLANNER, DEMONSTRATOR, RANDOM, FREQUENT = "planner", "demonstrator", "random", "frequent"
+ORACLE_FRAMES = "oracle_frames"
+"""The ceiling of a memory that chooses frames: its policies, which choose among those at which a sub-task began."""
 KINDS = {PLANNER: "ceiling", DEMONSTRATOR: "ceiling", RANDOM: "floor", FREQUENT: "floor"}
 ORACLE = "oracle"
 
@@ -195,10 +202,18 @@ UNTRAINED = (
 
 
 def run_episodes(
-    checkpoint: Path, folder: Path, specs: Sequence[EpisodeSpec], rules: Rules, video: str = "none"
+    checkpoint: Path,
+    folder: Path,
+    specs: Sequence[EpisodeSpec],
+    rules: Rules,
+    video: str = "none",
+    oracle: bool = False,
 ) -> list[EpisodeRecord]:
-    """Run what `folder` has no record of yet; all records. A policy that reads subgoals gets the simulator's."""
-    policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
+    """Run what `folder` has no record of yet; all records. A policy that reads subgoals gets the simulator's.
+
+    oracle: the memory chooses among the frames at which a sub-task began, as the probe's arm of this name.
+    """
+    policy: Policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
     kind = subgoal_kind(policy)
     subgoals = None if kind is None else build_predictor({"name": ORACLE, "kind": kind.removesuffix("_subgoal")})
     settings = RolloutSettings.from_config({
@@ -207,6 +222,11 @@ def run_episodes(
     })  # fmt: skip
     facts = facts_of(policy, None, str(checkpoint), settings, None if subgoals is None else ORACLE)
     facts = replace(facts, checkpoint=checkpoint.name)
+    if oracle:
+        arm = read_arm(ORACLE)
+        why = lacking(arm, policy, channel_of(policy), 0, boundaries=True)
+        require(why is None, f"oracle={facts.model}: it needs {why}. Name another model, or set oracle=null.")
+        policy, facts = ProbedPolicy(policy, arm).eval(), replace(facts, model=named(facts.model, arm))
     jobs = [Job(spec.task, spec.split, spec.episode) for spec in specs]
     done = evaluate(
         policy, jobs, folder, facts, settings, subgoals=subgoals, shard=choose_shard(rules.shard),
@@ -216,13 +236,22 @@ def run_episodes(
 
 
 def evaluate_row(
-    training: Path, checkpoint: Path, folder: Path, specs: Sequence[EpisodeSpec], rules: Rules
+    training: Path,
+    checkpoint: Path,
+    folder: Path,
+    specs: Sequence[EpisodeSpec],
+    rules: Rules,
+    oracle: str | None = None,
 ) -> list[EpisodeRecord]:
-    """Evaluate one training into a row's folder, which then says all about it (`config.yaml`, `trained.json`)."""
+    """Evaluate one training into a row's folder, which then says all about it (`config.yaml`, `trained.json`).
+
+    oracle: name of the row in which it is evaluated with the oracle's frames, a ceiling.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (DONE, ROW_CONFIG):
-        shutil.copy(training / name, folder / name)
-    return run_episodes(checkpoint, folder, specs, rules)
+    shutil.copy(training / ROW_CONFIG, folder / ROW_CONFIG)
+    about = read_json(training / DONE, "a training's end")
+    write_json(folder / DONE, about if oracle is None else {**about, "row": oracle, "kind": "ceiling"})
+    return run_episodes(checkpoint, folder, specs, rules, oracle=oracle is not None)
 
 
 def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord], rules: Rules) -> list[Path]:

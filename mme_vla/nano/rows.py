@@ -25,6 +25,8 @@ from mme_vla.utils import read_json, read_text
 CONFIG, TRAINED = "config.yaml", "trained.json"
 FILES = (CONFIG, RUN_FILE, TRAINED)
 SCENES = "scenes.json"
+CHOICES = "multi_choice"
+"""The action space of the benchmark's own table; rows of another one have a table of their own."""
 _SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "seed": "model_seed"}
 """Setting of `run.json` → field of its records."""
 
@@ -61,7 +63,7 @@ class Trained:
 class Training:
     """One training and its episodes, numbered from 0 within each task.
 
-    rules: limits of an episode. is_own: whether it is the user's.
+    rules: action space and limits of an episode. is_local: whether it is the user's.
     """
 
     folder: Path
@@ -69,6 +71,17 @@ class Training:
     records: Sequence[EpisodeRecord]
     rules: str
     is_local: bool = False
+
+    @property
+    def action_space(self) -> str:
+        """Of its records, as the benchmark calls it."""
+        return self.records[0].action_space
+
+    @property
+    def table(self) -> str:
+        """Name of the table that it belongs to, and of that table's folder: its split, and any other action space."""
+        split = self.records[0].split
+        return split if self.action_space == CHOICES else f"{split}-{self.action_space}"
 
     @property
     def scenes(self) -> dict[EpisodeKey, tuple[str, int, str, int]]:
@@ -146,7 +159,7 @@ def read_training(folder: Path) -> Training:
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
     settings = run["settings"]
     n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
-    rules = f"max_choices={n_choices}, only_possible={possible}"
+    rules = f"action_space={records[0].action_space}, max_choices={n_choices}, only_possible={possible}"
     return Training(folder, facts, _numbered(folder, records), rules)
 
 

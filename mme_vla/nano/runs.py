@@ -1,6 +1,7 @@
 """A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as it is not there."""
 
 import logging
+import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -153,6 +154,7 @@ def evaluate_all(
     from mme_vla.nano.evaluating import (
         DEMONSTRATOR,
         FREQUENT,
+        ORACLE_FRAMES,
         PLANNER,
         RANDOM,
         evaluate_row,
@@ -164,10 +166,13 @@ def evaluate_all(
     records: dict[str, list[EpisodeRecord]] = {}
     for row, of_row in jobs.items():
         selected = episodes_of(config, folder, config["also_episodes"]) if of_also(config, row) else specs
-        records[row] = []
-        for job in of_row:
-            place = folder / row / str(job.config["seed"])
-            records[row] += evaluate_row(job.folder, job.checkpoint, place, selected, rules)
+        model, at, budget = row.partition("@")
+        oracle = f"{ORACLE_FRAMES}{at}{budget}" if model == config["oracle"] else None
+        for name in [row] if oracle is None else [row, oracle]:
+            records[name] = []
+            for job in of_row:
+                place, ceiling = folder / name / str(job.config["seed"]), None if name == row else oracle
+                records[name] += evaluate_row(job.folder, job.checkpoint, place, selected, rules, ceiling)
     if config["shard"] is None:
         by_choice = bool(robot.action.choice)
         moves = frequent_moves(files, robot.action) if by_choice else {}
@@ -308,25 +313,30 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     return [file for group in groups for file in group.files]
 
 
+def processor_seconds() -> float:
+    """Seconds of processors that this process and those of its processes that ended have used."""
+    return sum(os.times()[:4])
+
+
 class Minutes:
-    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors for this process."""
+    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors (`processor_seconds`)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     @property
     def spent(self) -> dict[str, list[float]]:
-        """Stage → minutes on the clock, and of this process; other runs of the command may add to them meanwhile."""
+        """Stage → minutes on the clock, and of processors; other runs of the command may add to them meanwhile."""
         return read_json(self._path, "minutes of a run") if self._path.is_file() else {}
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
         """Time what happens inside; a stage that had nothing to do counts its moment."""
-        begun = time.perf_counter(), time.process_time()
+        begun = time.perf_counter(), processor_seconds()
         try:
             yield
         finally:
-            now = time.perf_counter(), time.process_time()
+            now = time.perf_counter(), processor_seconds()
             spent = self.spent
             before = spent.get(stage, [0.0, 0.0])
             spent[stage] = [old + (b - a) / 60 for old, a, b in zip(before, begun, now, strict=True)]

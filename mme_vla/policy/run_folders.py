@@ -52,19 +52,19 @@ def newest_write(run: Path) -> int:
 
 LATEST = "latest"
 """`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
-SHIPPED = "nano"
-"""The checkpoint that ships with the library: four tokens of memory, solves VideoUnmask (docs/train/nano.md)."""
+SHIPPED = ("nano",)
+"""The checkpoints that ship with the library, folders of `mme_vla/assets` (docs/train/nano.md)."""
 
 
 def find_run(path: Path) -> Path:
-    """`path`, the newest run where it ends in `latest`, or the shipped checkpoint where it is `nano`.
+    """`path`, the newest run where it ends in `latest`, or the checkpoint that ships under this name (`SHIPPED`).
 
     A file or folder of that name goes first.
     """
     if path.exists():
         return path
-    if str(path) == SHIPPED:
-        return Path(str(files("mme_vla").joinpath("assets", SHIPPED)))
+    if str(path) in SHIPPED:
+        return Path(str(files("mme_vla").joinpath("assets", str(path))))
     if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if newest_write(run)]
@@ -75,7 +75,7 @@ def find_run(path: Path) -> Path:
 def resolve_checkpoint(path: Path) -> Path:
     """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
 
-    A path that ends in `latest` means the newest run of its folder, and `nano` the shipped checkpoint.
+    A path that ends in `latest` means the newest run of its folder, and a name of `SHIPPED` that checkpoint.
     """
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():

@@ -6,6 +6,7 @@ import nano_board
 import pytest
 
 from helpers.nano_rows import TASKS, write_training
+from mme_vla.utils import write_json
 
 
 def test_the_pages_are_those_of_the_committed_rows() -> None:
@@ -30,9 +31,19 @@ def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch:
     for seed, won in enumerate((3, 2)):
         write_training(tmp_path / "run", "framesamp_modul", seed, won)
     write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
+    write_json(tmp_path / "run" / "scenes.json", {"split": "further", "tried": {f"{TASKS[0]} 0": ""}})
+    nano_board.add(tmp_path / "run" / "pi05")
+    assert [path.name for path in sorted((tmp_path / "rows" / "further").iterdir())] == ["pi05", "scenes.json"]
     nano_board.add(tmp_path / "run")
     (board,) = nano_board.boards()
     text = nano_board.block(board)
     assert "| framesamp_modul | 1 [1, 1] | 2 | 83.33 ± 23.57 |" in text and "Not run yet: `demonstrator`" in text
     assert "`framesamp_modul`" not in text.partition("Not run yet")[2]
-    assert "### Success by task (%)" in nano_board.evidence([board])
+    write_training(tmp_path / "motions", "framesamp_modul", 0, 1, action_space="waypoint")
+    nano_board.add(tmp_path / "motions")
+    assert (tmp_path / "rows" / "further-waypoint" / "framesamp_modul" / "0" / "trained.json").is_file()
+    both = nano_board.boards()
+    assert [made.action_space for made in both] == ["multi_choice", "waypoint"]
+    page = nano_board.evidence(both)
+    assert page.count("### Success by task (%)") == 2 and "## Split `further`, `waypoint`" in page
+    assert nano_board.block(both[0]) == text

@@ -1,6 +1,7 @@
 """Rollouts draw what is looked at, and nothing changes: actions and outcomes are those of drawing everything."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import VIDEO
 from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
+from mme_vla.evaluation.rollout.render_plan import RenderPlan
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
@@ -38,6 +41,23 @@ def test_rendering_what_is_needed_changes_no_action(name: str) -> None:
         assert video["front"] == full["front"] == full["wrist"]
     else:
         assert full["front"] < FRAMES[1] and video["front"] < FRAMES[0]
+
+
+@pytest.mark.parametrize("name", ["present_modul", "ttt_modul", "moment_modul"])
+def test_of_a_robot_that_acts_at_any_frame_few_past_frames_are_rendered(name: str) -> None:
+    memory = {} if name == "present_modul" else {"every": 16}
+    policy = quick_policy(name, patch_size=8, embodiment="robomme_choice_front", memory=memory)
+    plan = RenderPlan(policy, None, RolloutSettings.from_config({"max_steps": 100}))
+    stored = [] if name == "present_modul" else [0, *range(15, 1999, 16)]
+    before = plan.before_video()
+    assert before is not None and sorted(before.frames["front"]) == stored  # type: ignore[type-var]
+    frames: dict[str, Any] = {"state": np.zeros((41, 8))}
+    images = [None if number not in stored else np.zeros(1) for number in range(41)]
+    assert plan.missing({**frames, "front": images}) is None, "the video is simulated once"
+    running = SimpleNamespace(episode=SimpleNamespace(n_observed_frames=41), video_frames=40, unobserved=0)
+    chunk = plan.of_chunk(running, 1)  # type: ignore[arg-type]
+    assert chunk is not None and sorted(chunk.frames["front"]) == [f for f in stored if 41 <= f < 140]  # type: ignore[type-var]
+    assert chunk.now == ("front",), "the frame that the policy acts on is rendered, whatever its number"
 
 
 class Watcher(SubgoalPredictor):

@@ -18,7 +18,13 @@ SPLIT, SCENES = "further", 3
 
 
 def write_training(
-    root: Path, row: str, seed: int, won: Mapping[str, int] | int, kind: str = "policy", **facts: Any
+    root: Path,
+    row: str,
+    seed: int,
+    won: Mapping[str, int] | int,
+    kind: str = "policy",
+    action_space: str = "multi_choice",
+    **facts: Any,
 ) -> Path:
     """A folder of a training that solves the first so many scenes of each task."""
     folder = root / row / str(seed)
@@ -39,7 +45,7 @@ def write_training(
             outcome = "success" if spec.episode < count else "fail"
             records.append(EpisodeRecord(
                 model, 100, 7, task, spec.episode, spec.seed, spec.difficulty, outcome, 9, split=SPLIT, max_steps=500,
-                memory_budget=budget, composition=composition_digest(config),
+                action_space=action_space, memory_budget=budget, composition=composition_digest(config),
                 training=TrainingIdentity(seed, **identity) if trained else None,
             ))  # fmt: skip
     write_records(folder, records)

@@ -225,8 +225,9 @@ def test_past_frames_without_states_are_refused() -> None:
 # All of them
 
 SMALLER: dict[str, dict[str, Any]] = {
-    "retrieval": {"budget": 64, "every": 4}, "moment": {"budget": 32}, "gist": {"budget": 160, "stride": 8},
-    "actions": {"max_steps": 32, "max_video": 8}, "learned_topk": {"budget": 48, "pool": 8},
+    "retrieval": {"budget": 64, "every": 4}, "moment": {"budget": 32, "every": 16},
+    "gist": {"budget": 160, "stride": 8, "every": 4},
+    "actions": {"max_steps": 32, "max_video": 8}, "learned_topk": {"budget": 48, "pool": 8, "every": 4},
     "spacetime": {"frames": 3, "stride": 5}, "anchors": {"spacing": 5}, "events": {"budget": 64, "stride": 4},
     "pyramid": {"budget": 128, "strides": [1, 4]}, "keyframes": {"budget": 64, "every": 4, "pool": 8},
 }  # fmt: skip

@@ -229,6 +229,38 @@ def test_frames_of_a_running_video_are_those_of_the_finished_episode():
         assert running[-1] == step
 
 
+def test_past_frames_are_the_same_at_every_step_with_every():
+    for exec_start in (0, 66, 400, 2000):
+        lists = [recurrent_frames(step, exec_start, 64, 40, 32, every=16) for step in range(0, 1300, 7)]
+        for step, frames in zip(range(0, 1300, 7), lists, strict=True):
+            past = frames[frames < step]
+            assert ((past == 0) | ((past + 1) % 16 == 0)).all() and (np.diff(frames) > 0).all()
+            assert frames[-1] == step and len(frames) <= 64
+    assert recurrent_frames(50, 0, every=16).tolist() == [0, 15, 31, 47, 50]
+    assert recurrent_frames(300, 0, 3, every=16).tolist() == [271, 287, 300], "the earliest are dropped first"
+    assert recurrent_frames(20, 21, every=16).tolist() == recurrent_frames(20, 700, every=16).tolist()
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("exec_start", [0, 30])
+def test_an_uneven_pace_continues_with_every(make, exec_start):
+    memory = make(every=16)
+    history, stream, read = RandomHistory(exec_start + 1, exec_start), memory.start_stream(), set()
+    for more in (0, 5, 20, 16, 3, 47, 0):
+        history.length += more
+        now, step = memory.encode([history], [stream]), len(history) - 1
+        assert same_memory(now, memory(window(memory, len(history), exec_start)))
+        read |= {int(frame) for frame in memory.frames(history, step) if frame < step or (step + 1) % 16 == 0}
+    assert stream.updates <= len(read) + 7, "each past frame enters once, each current one once"
+
+
+def test_every_needs_a_stride_that_is_a_multiple_and_no_jitter():
+    with pytest.raises(UserError, match=r"memory\.stride=24 must be a multiple of memory\.every=16, such as 32"):
+        TTT(D_VISION, 16, stride=24, every=16)
+    with pytest.raises(UserError, match=r"memory\.jitter=3 .* set memory\.jitter=0 or memory\.every=1"):
+        TTT(D_VISION, 16, every=16, jitter=3)
+
+
 def test_jitter_keeps_order_parts_and_the_current_frame():
     memory = TTT(D_VISION, 16, jitter=5)
     history = RandomHistory(400, exec_start=100)

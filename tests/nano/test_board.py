@@ -110,6 +110,10 @@ def test_targets_have_intervals_and_are_not_reached_by_weak_evidence(board: Boar
     assert not any(t.reached for t in suites)
     alone = Board(read_rows([write_training(tmp_path, "a", 0, 1).parent]), samples=50)
     assert [t.measured for t in alone.targets()] == ["33.3 % (a)", "not run yet"]
+    for row in ("a", "present_modul"):
+        write_training(tmp_path / "none", row, 0, 0)
+    none = Board(read_rows([tmp_path / "none"]), samples=50)
+    assert [t.measured for t in none.targets()] == ["0.0 % (a)", "not run yet"]
 
 
 def test_tasks_that_separate_memories_stand_out() -> None:
@@ -280,8 +284,22 @@ def test_rows_of_different_rules_do_not_make_a_board(rows: Path, tmp_path: Path)
     settings = json.loads((folder / "run.json").read_text())["settings"]
     (folder / "run.json").unlink()
     claim_run(folder, {**settings, "max_actions": 20, "only_possible": True})
-    with pytest.raises(UserError, match=r"mine/0 has max_choices=20, only_possible=True, but .*None.*False"):
+    with pytest.raises(UserError, match=r"mine/0 has .*, max_choices=20, only_possible=True, but .*None.*False"):
         read_rows([rows, tmp_path])
+
+
+def test_planned_motions_have_a_table_of_their_own(
+    rows: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    motions = write_training(tmp_path / "run", "mine", 0, 2, action_space="waypoint").parents[1]
+    with pytest.raises(UserError, match=r"has action_space=waypoint, .*, but .*action_space=multi_choice"):
+        read_rows([rows, motions])
+    write_training(tmp_path / "shipped" / "further-waypoint", "pi05", 0, 1, action_space="waypoint")
+    monkeypatch.setattr(board_command, "SHIPPED", tmp_path / "shipped")
+    board_command.main([f"rows={motions}", "--samples", "50"], lambda: None, nano_command.with_settings)
+    printed = capsys.readouterr().out
+    assert "mine: place 1 of 2" in printed and "Actions are `waypoint`, not choices." in printed
+    assert "Targets" not in printed, "which are of choices"
 
 
 def test_trainings_of_a_row_are_of_one_recipe_and_not_copies(tmp_path: Path) -> None:
@@ -330,7 +348,7 @@ def test_a_model_is_trained_before_the_board_is_made(
     monkeypatch.setattr(board_command, "SHIPPED", tmp_path / "none")
     words = ["task=VideoUnmask", "model=mine_modul", f"split={SPLIT}", f"output={tmp_path}", "beside=[pi05]"]
     board_command.main([*words, "--samples", "50"], train, nano_command.with_settings)
-    assert typed == [[*words, "planner=false", "floors=false", "trainings=1"]]
+    assert typed == [[*words, "planner=false", "oracle=null", "floors=false", "trainings=1"]]
     assert "mine_modul: place 1 of 1" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         board_command.main([f"split={SPLIT}"], train, nano_command.with_settings)

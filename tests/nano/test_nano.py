@@ -1,5 +1,6 @@
 """The nano backbone, its tower and its tokens; and what stands between demonstrations and training."""
 
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.nano.runs import counts_of
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.run_folders import SHIPPED, resolve_checkpoint
 from mme_vla.testing import check_backbone
 
 SMALL = {
@@ -90,6 +92,16 @@ def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
     frames = np.stack([made.images["front"].get(frame, made.images["front"][0]) for frame in range(67)])
     episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
     assert policy.act(episode).shape == (4, 7)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_checkpoints_are_small_and_whole(name: str) -> None:
+    folder = resolve_checkpoint(Path(name))
+    lines = [line.split() for line in (folder / "SHA256SUMS").read_text().splitlines()]
+    for digest, file in lines:
+        assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest, file
+    assert sum(path.stat().st_size for path in folder.iterdir()) <= 20e6
+    assert MMEPolicy.from_pretrained(name).require_processor().stats is not None
 
 
 def test_policies_of_earlier_versions_highlight_what_the_goal_names_first_in_images_and_memory() -> None:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
+from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
@@ -20,6 +21,8 @@ from mme_vla.nano import evaluating
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.evaluating import Rules, built_scenes, frequent_moves, play_all
 from mme_vla.nano.learning import Decisions, choice_errors, statistics
+from mme_vla.nano.rows import read_rows
+from mme_vla.nano.runs import compose_rows
 from mme_vla.policy.mme import MMEPolicy
 
 
@@ -53,6 +56,29 @@ def test_present_gives_the_current_frame_and_as_many_parameters_as_a_memory() ->
     present.require_processor().stats = statistics([made], present)
     history = Decisions.of(present, [made]).batch.history
     assert history is not None and history.positions[:, :, 0].float().std(1).max() == 0
+
+
+def test_all_memories_read_decisions_and_the_same_frames() -> None:
+    rows = compose_rows(resolved(compose("nano", ["nano=nano16"])))
+    decisions = np.array([66, 71, 140, 333, 640, 1201])
+    stored, every = {0, *range(15, 1300, 16)}, set[int]()
+    for choice in rows.choices:
+        read = choice.read(decisions, 66)
+        assert read <= stored | set(decisions.tolist()), choice.memory
+        every |= read
+    assert {choice.memory["name"] for choice in rows.choices if choice.memory} == {
+        "framesamp", "tokendrop", "ttt", "rmt", "present", "retrieval", "gist", "moment", "actions", "learned_topk",
+        "bank", "anchors", "events", "pyramid", "keyframes",
+    }  # fmt: skip
+    of_one = compose_rows(resolved(compose("nano", ["nano=nano16", "with_memory=framesamp_modul", "also=[]"])))
+    assert every == set().union(*(choice.read(decisions, 66) for choice in of_one.choices)), "later rows render none"
+
+
+def test_planned_motions_of_several_tasks_are_one_run() -> None:
+    config = resolved(compose("nano", ["nano=motions"]))
+    rows = compose_rows(config)
+    assert rows.robot.action.answers == "waypoint" and rows.blind == "pi05" and len(config["task"]) == 5
+    assert {each["backbone"]["name"] for each in rows.composed.values()} == {"nano"}
 
 
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +178,9 @@ def test_the_command_learns_two_tasks_and_continues_in_a_fresh_process(tmp_path:
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     rows = {path.parent.parent.name: json.loads(path.read_text()) for path in tmp_path.glob("val/*/*/trained.json")}
-    assert set(rows) == {"framesamp_modul", "pi05", "demonstrator", "random", "frequent"}
+    assert set(rows) == {"framesamp_modul", "oracle_frames", "pi05", "demonstrator", "random", "frequent"}
+    oracle = {**rows["framesamp_modul"], "row": "oracle_frames", "kind": "ceiling"}
+    assert rows["oracle_frames"] == oracle and len(read_rows([tmp_path / "val"])) == 6
     assert rows["pi05"]["demonstrations"] == {"StopCube": 2, "MoveCube": 2} and rows["pi05"]["val_loss"] > 0
     for row in tmp_path.glob("val/*/0"):
         assert len((row / "episodes.jsonl").read_text().splitlines()) == 2, row

@@ -1,5 +1,7 @@
 """A sweep over memories, budgets and trainings is one run: demonstrations and tokens once, one table."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +43,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     original = tokens.tokenize
     monkeypatch.setattr(tokens, "tokenize", lambda *args: made.append(args) or original(*args))
 
-    def episodes(checkpoint: Path, *_: Any) -> list[EpisodeRecord]:
+    def episodes(checkpoint: Path, *_: Any, **__: Any) -> list[EpisodeRecord]:
         policy = MMEPolicy.from_pretrained(str(checkpoint))
         return [
             EpisodeRecord(str(policy.config["name"]), 2, 7, "VideoUnmask", n, n, "easy", "success" if n else "fail", 9,
@@ -66,6 +68,16 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     assert about["demonstrations"] == {"VideoUnmask": 2} and about["parameters"] > 1e6 and about["update_flops"] > 1e6
     runs.run(resolved(compose("nano", words)))
     assert len(made) == 2, "a finished run is not made again"
+
+
+def test_minutes_count_the_processors_of_processes(tmp_path: Path) -> None:
+    minutes = runs.Minutes(tmp_path / "minutes.json")
+    work = "import time\nwhile time.process_time() < 0.3: pass"
+    for _ in range(2):
+        with minutes.of("training"):
+            subprocess.run([sys.executable, "-c", work], check=True)
+    clock, processors = minutes.spent["training"]
+    assert clock > 0 and processors > 0.5 / 60, "of both runs of the stage"
 
 
 def test_the_digest_of_demonstrations_does_not_depend_on_rendered_frames(tmp_path: Path) -> None:

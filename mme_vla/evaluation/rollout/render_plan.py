@@ -6,7 +6,7 @@ needed, it begins once more, and the same simulation then renders them.
 """
 
 from collections.abc import Container
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -15,13 +15,13 @@ from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.events import read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.memory.base import past_view_spec
+from mme_vla.memory.base import past_view_spec, union_frames
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
 EVERY = range(2**31)  # Whatever frames there are
-LONGEST_VIDEO = 10_000  # frames
+LONGEST_VIDEO = 2_000  # frames; what is missing of a longer one is rendered by a second reset
 
 
 class RenderPlan:
@@ -49,14 +49,9 @@ class RenderPlan:
         """For a reset, before it is known how long the video is: what is certain to be wanted."""
         if self._all:
             return None
-        memory = self._policy.memory
         if self._sees_video or self._resampled:
             return self._render_request(EVERY)
-        # Of memories that keep few frames all are rendered at once, of others none.
-        few = memory is not None and memory.storage.keep_every > 1
-        return self._render_request(
-            frozenset(memory.storage.stored_frames(LONGEST_VIDEO).tolist()) if memory and few else ()
-        )
+        return self._render_request(self._read_of_videos)
 
     def missing(self, frames: Observation) -> RenderRequest | None:
         """For a second reset, after one that gave these frames; None where it gave all that is needed."""
@@ -88,10 +83,29 @@ class RenderPlan:
         frames: list[int] = reads[(reads >= first) & (reads < stop)].tolist()
         return frames
 
+    @cached_property
+    def _read_of_videos(self) -> Container[int]:
+        """Frames that the policy may read of a video, however long it is; none where that may be most of them."""
+        read = self._read_before(np.arange(LONGEST_VIDEO), LONGEST_VIDEO)
+        few = read is not None and len(read) < LONGEST_VIDEO / 2
+        return frozenset(read.tolist() if read is not None and few else ())
+
+    def _read_before(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """Frames that the policy reads at any of these steps, but for the current one, which is rendered anyway."""
+        lists = []
+        for step in steps:
+            read = frames_read(self._policy, np.array([step]), exec_start)
+            if read is None:
+                return None
+            lists.append(read[read != step])
+        return union_frames(lists)
+
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""
         # A motion, or an event that holds the robot, takes any number of frames: the policy may act at each.
         action, most = self._robot.action, self._settings.max_steps + self._hold_steps + 2
         anywhere = action.frames is None or self._hold_steps
-        apart = 1 if anywhere else min(self._settings.execute or action.execute, action.horizon)
+        if anywhere:
+            return self._read_before(exec_start + np.arange(most), exec_start)
+        apart = min(self._settings.execute or action.execute, action.horizon)
         return frames_read(self._policy, exec_start + np.arange(0, most, apart), exec_start)

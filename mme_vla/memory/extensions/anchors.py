@@ -13,6 +13,7 @@ from mme_vla.memory.base import PerceptualMemory
 from mme_vla.memory.extensions.attending import FrameMemory
 from mme_vla.memory.framesamp import budget_frames
 from mme_vla.memory.history import StorageSpec
+from mme_vla.memory.recurrent import check_every, recurrent_frames
 from mme_vla.registry import MEMORIES
 
 
@@ -29,6 +30,7 @@ class Anchors(FrameMemory, PerceptualMemory):
         grid: int = 4,
         pooling: str = "mean",
         spacing: int = 1,
+        every: int = 1,
         **encoder: Any,
     ) -> None:
         """See `PerceptualMemory`.
@@ -36,14 +38,15 @@ class Anchors(FrameMemory, PerceptualMemory):
         Args:
             budget: memory tokens; 48 hold the first frame and the last two.
             grid, pooling: a frame is grid×grid tokens.
-            spacing: frames between two of the last ones, of which the current frame is one.
+            spacing, every: frames between two of the last ones, of which the current frame is one, and how they are
+                counted (`recurrent_frames`).
         """
         check_sizes("memory", spacing=spacing)
+        check_every(every, spacing, "spacing")
         frames = budget_frames(budget, grid, at_least=2)
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
-        self.recent, self.spacing = frames - 1, spacing
+        self.recent, self.spacing, self.every = frames - 1, spacing, every
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """Frame 0 and the last ones, ascending."""
-        last = step - self.spacing * np.arange(self.recent)
-        return np.union1d([0], last[last > 0])
+        return np.union1d([0], recurrent_frames(step, 0, self.recent, stride=self.spacing, every=self.every))

@@ -15,7 +15,7 @@ from torch.nn import functional
 from mme_vla.errors import check_choice, check_sizes, require
 from mme_vla.memory.extensions.attending import FrameMemory, by_frame
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden, recurrent_frames
+from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -35,6 +35,7 @@ class Banked(FrameMemory):
         pooling: str = "mean",
         *,
         stride: int = 16,
+        every: int = 1,
         moments: int = 32,
         video: int = 16,
         hidden: int | None = None,
@@ -50,12 +51,13 @@ class Banked(FrameMemory):
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             budget: most memory tokens; grid×grid of them are made.
             grid, pooling: a moment is grid×grid tokens.
-            stride, moments, video: which frames are moments (`recurrent_frames`), the current one among them.
+            stride, every, moments, video: which frames are moments (`recurrent_frames`), the current one among them.
             hidden: width of the bank; by default a quarter of `d_vision`, at least 64.
             length, retrieval_layers, time_code, fusion, consolidation: as for `MemoryBank`.
         """
         super().__init__()
         check_sizes("memory", grid=grid, stride=stride, video=video)
+        check_every(every, stride)
         require(
             1 < moments > video, f"memory.moments={moments} must be at least 2, and more than memory.video={video}."
         )
@@ -63,7 +65,8 @@ class Banked(FrameMemory):
             budget >= grid**2, f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}."
         )
         hidden = default_hidden(d_vision, hidden)
-        self.budget, self.stride, self.moments, self.video = grid**2, stride, moments, video
+        self.budget, self.moments, self.video = grid**2, moments, video
+        self.stride, self.every = stride, every
         self.storage = StorageSpec(grid, pooling)
         self.capacity = moments * grid**2
         self.reduce, self.output = nn.Linear(d_vision, hidden), nn.Linear(hidden, width)
@@ -71,7 +74,7 @@ class Banked(FrameMemory):
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The moments at `step`, the last of them `step` itself."""
-        return recurrent_frames(step, exec_start, self.moments, self.video, self.stride)
+        return recurrent_frames(step, exec_start, self.moments, self.video, self.stride, self.every)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2

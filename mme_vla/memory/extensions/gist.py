@@ -18,7 +18,7 @@ from mme_vla.memory.base import FeatureEncoder
 from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden, recurrent_frames
+from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -42,6 +42,7 @@ class Gist(FrameMemory):
         grid: int = 4,
         pooling: str = "mean",
         stride: int = 16,
+        every: int = 1,
         layers: int = 2,
         hidden: int | None = None,
         heads: int | None = None,
@@ -54,12 +55,14 @@ class Gist(FrameMemory):
             budget: most memory tokens; what whole frames leave of it holds gists.
             anchors, recent: whole frames at the beginning and at the end. gists: tokens of each frame between.
             grid, pooling: a frame that is read is grid×grid tokens.
-            stride: frames between two that are read, counted back from the current one; the first is always read.
+            stride, every: frames between two that are read, and how they are counted (`recurrent_frames`); the first is
+                always read.
             layers, hidden, heads: of the gists' encoder; its width is by default a quarter of `d_vision`, at least 64.
             encoder: `position_dim`, `position_hidden` and `positions` of both `FeatureEncoder`s.
         """
         super().__init__()
         check_sizes("memory", anchors=anchors, recent=recent, gists=gists, stride=stride, layers=layers)
+        check_every(every, stride)
         full_tokens = (anchors + recent) * grid**2
         require(
             budget >= full_tokens + gists,
@@ -68,7 +71,7 @@ class Gist(FrameMemory):
         )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
-        self.anchors, self.recent, self.gists, self.stride = anchors, recent, gists, stride
+        self.anchors, self.recent, self.gists, self.stride, self.every = anchors, recent, gists, stride, every
         self.between = (budget - full_tokens) // gists
         self.budget = full_tokens + self.between * gists
         self.storage = StorageSpec(grid, pooling)
@@ -81,7 +84,7 @@ class Gist(FrameMemory):
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames read at `step`, ascending, the first frame and `step` among them."""
-        everything = recurrent_frames(step, exec_start, step + 2, step + 2, self.stride)
+        everything = recurrent_frames(step, exec_start, step + 2, step + 2, self.stride, self.every)
         frames = np.union1d([0], everything)
         first, last = frames[: self.anchors], frames[self.anchors :][-self.recent :]
         between = frames[len(first) : len(frames) - len(last)]

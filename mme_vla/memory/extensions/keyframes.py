@@ -18,7 +18,7 @@ from torch.nn import functional
 from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.extensions.attending import by_frame, rows_at
-from mme_vla.memory.framesamp import budget_frames, evenly_spaced_frames
+from mme_vla.memory.framesamp import budget_frames, evenly_spaced_stored_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import default_hidden, full_precision, linear
 from mme_vla.registry import MEMORIES
@@ -66,8 +66,7 @@ class Keyframes(PerceptualMemory, ReadsLabels):
 
     def selected_frames(self, step: int) -> np.ndarray:
         """The frames that the head reads at `step`, ascending, the newest stored one among them."""
-        stored = self.storage.stored_frames(step + 1)
-        return stored[evenly_spaced_frames(len(stored) - 1, self.pool)]
+        return evenly_spaced_stored_frames(self.storage, step, self.pool)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([self.selected_frames(int(step)) for step in steps])

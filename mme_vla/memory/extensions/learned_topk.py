@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from mme_vla.errors import require
 from mme_vla.memory.base import FeatureEncoder, MemoryModule, all_patches, union_frames
 from mme_vla.memory.extensions.attending import ReadingBlock, heads_of, rows_at
-from mme_vla.memory.framesamp import evenly_spaced_frames
+from mme_vla.memory.framesamp import evenly_spaced_stored_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.registry import MEMORIES
@@ -42,6 +42,7 @@ class LearnedTopK(MemoryModule):
         budget: int = 256,
         *,
         pool: int = 64,
+        every: int = 1,
         grid: int = 4,
         pooling: str = "mean",
         temperature: float = 1.0,
@@ -56,6 +57,7 @@ class LearnedTopK(MemoryModule):
         Args:
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             budget: memory tokens. pool: frames whose tokens compete for them.
+            every: frames 0 and k·every − 1 can compete; the others are neither rendered nor encoded. 1: all.
             grid, pooling: a frame is grid×grid tokens.
             temperature: how far from the k-th best a score may be to be learned from; scores have variance 1.
             layers, registers, hidden, heads: of the network that scores; its width is by default a quarter of
@@ -76,7 +78,7 @@ class LearnedTopK(MemoryModule):
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
         self.budget, self.pool, self.temperature = budget, pool, temperature
-        self.storage = StorageSpec(grid, pooling)
+        self.storage = StorageSpec(grid, pooling, every)
         self.capacity = pool * grid**2
         self.judge = FeatureEncoder(d_vision, hidden, **encoder)
         self.registers = nn.Parameter(torch.randn(registers, hidden) * hidden**-0.5)
@@ -85,11 +87,15 @@ class LearnedTopK(MemoryModule):
         self.encoder = FeatureEncoder(d_vision, width, **encoder)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return union_frames([evenly_spaced_frames(int(step), self.pool) for step in steps])
+        return union_frames([self.selected_frames(int(step)) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """The candidates: which of them are kept is `forward`'s matter."""
-        return all_patches(evenly_spaced_frames(step, self.pool), self.storage.grid)
+        return all_patches(self.selected_frames(step), self.storage.grid)
+
+    def selected_frames(self, step: int) -> np.ndarray:
+        """The frames whose tokens compete at `step`."""
+        return evenly_spaced_stored_frames(self.storage, step, self.pool)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         selected, soft = self.keep(self.scores(history), history.mask)

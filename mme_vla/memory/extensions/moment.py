@@ -18,7 +18,7 @@ from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import FeatureEncoder
 from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.recurrent import default_hidden, recurrent_frames
+from mme_vla.memory.recurrent import check_every, default_hidden, recurrent_frames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -39,6 +39,7 @@ class Moment(FrameMemory):
         grid: int = 8,
         pooling: str = "mean",
         stride: int = 16,
+        every: int = 1,
         layers: int = 2,
         hidden: int | None = None,
         heads: int | None = None,
@@ -51,18 +52,21 @@ class Moment(FrameMemory):
             budget: most memory tokens; budget / moments frames are read.
             moments: learned tokens that ask every frame.
             grid, pooling: a frame that is read is grid×grid tokens.
-            stride: frames between two that are read (`recurrent_frames`; up to 5/8 of them from the video).
+            stride, every: frames between two that are read, and how they are counted (`recurrent_frames`; up to 5/8 of
+                them from the video).
             layers, hidden, heads: of the causal encoder; its width is by default a quarter of `d_vision`, at least 64.
             encoder: `position_dim`, `position_hidden` and `positions` of the `FeatureEncoder`.
         """
         super().__init__()
         check_sizes("memory", moments=moments, stride=stride, layers=layers)
+        check_every(every, stride)
         require(
             budget % moments == 0 < budget, f"memory.budget={budget} must be a multiple of memory.moments={moments}."
         )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
-        self.budget, self.moments, self.stride, self.steps = budget, moments, stride, budget // moments
+        self.budget, self.moments, self.steps = budget, moments, budget // moments
+        self.stride, self.every = stride, every
         self.storage = StorageSpec(grid, pooling)
         self.capacity = self.steps * grid**2
         self.encoder = FeatureEncoder(d_vision, hidden, **encoder)
@@ -73,7 +77,7 @@ class Moment(FrameMemory):
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames read at `step`, the last of them `step`."""
-        return recurrent_frames(step, exec_start, self.steps, max(5 * self.steps // 8, 1), self.stride)
+        return recurrent_frames(step, exec_start, self.steps, max(5 * self.steps // 8, 1), self.stride, self.every)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2
