@@ -10,6 +10,7 @@ import torch
 
 from helpers.nano_policies import demonstration, nano
 from mme_vla import UserError
+from mme_vla.backbone.tower import CLASSES, by_class, summarise
 from mme_vla.cli import nano as nano_command
 from mme_vla.cli.nano import with_settings
 from mme_vla.nano.demonstrations import Demonstration
@@ -116,13 +117,29 @@ def test_policies_of_earlier_versions_highlight_what_the_goal_names_first_in_ima
     assert torch.equal(annotated[1], tokens[1])
 
 
-def test_the_goal_weighs_what_is_seen_by_its_words_and_not_by_what_is_behind_them() -> None:
+def test_the_goal_selects_classes_by_its_words_and_not_by_what_is_behind_them() -> None:
     policy = nano("pi05")
     backbone, processor = policy.backbone, policy.require_processor()
     goals = ["pick up the red cube", "pick up the green cube"]
     ids, masks = (torch.stack(part) for part in zip(*map(processor.prompt, goals), strict=True))
-    tokens = torch.ones(2, 3, backbone.vision_width)
+    tokens = torch.rand(2, 3, backbone.vision_width)
     with torch.no_grad():
         read = backbone.condition_on_prompt(tokens, ids, masks)
         padded = backbone.condition_on_prompt(tokens, torch.where(masks, ids, 7), masks)
-    assert torch.equal(read, padded) and not torch.allclose(read[0], read[1])
+        selected = backbone.goal_reader.select(backbone._words(ids), masks)
+    seen = backbone.vision.token_width
+    assert torch.equal(read, padded) and torch.equal(read[..., :seen], tokens[..., :seen])
+    expected = torch.einsum("bqk,bnkf->bnqf", selected, by_class(tokens[..., :seen])).flatten(-2)
+    assert torch.allclose(read[..., seen:], expected) and torch.allclose(selected.sum(-1), torch.tensor(1.0))
+    assert not torch.allclose(selected[0], selected[1])
+
+
+def test_features_of_a_class_are_those_that_the_tower_gives_it() -> None:
+    presence, offsets = torch.zeros(1, len(CLASSES), 32, 32), torch.zeros(1, len(CLASSES), 2, 32, 32)
+    presence[:, 3, 8:10, 8:10] = 1
+    features = by_class(summarise(presence, offsets))
+    assert features.shape == (1, 64, len(CLASSES), 20)
+    assert (
+        features[:, :, 3].abs().sum() > 0
+        and features[:, :, [i for i in range(len(CLASSES)) if i != 3]].abs().sum() == 0
+    )
