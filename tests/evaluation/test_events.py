@@ -78,15 +78,20 @@ def test_events_are_read_from_one_word() -> None:
 
 
 @pytest.mark.parametrize(("arm", "words"), [
-    ("pause:-5", "event.pause.steps=-5 must be a whole number, 0 or more"), ("pause:1.5", "event.pause.steps=1.5"),
-    ("paus:5", "Unknown event 'paus'. Did you mean 'pause'"), ("pause:5@subtsk:2", "place='subtsk'.*subtask"),
+    ("pause:-5", "event=pause:-5: pause.steps=-5 must be a whole number, 0 or more"),
+    ("pause:1.5", "event=pause:1.5: pause.steps=1.5"), ("gap:-1", "event=gap:-1: gap.frames=-1"),
+    ("paus:5", "event=paus:5: name='paus'. Did you mean 'pause'"),
+    ("pause:5@subtsk:2", "event=pause:5@subtsk:2: place='subtsk'.*subtask"),
+    ("pause:5@subtask:pick", "event=pause:5@subtask:pick: write pause:100"),
     ("pause:5@subtask:0", "subtask:0 must be 1 or more"), ("pause:5@step:-1", "step:-1 must be 0 or more"),
-    ("speed:2@step:4", "takes no place"), ("restart:4", "takes no number"), ("speed:0", "event.speed.factor=0"),
-    ("5", "event=5: write pause:100"), (["pause:5", "pause:5"], "each once"), (7, "event=7"),
+    ("speed:2@step:4", "takes no place"), ("restart:4", "takes no number"),
+    ("speed:0", "event=speed:0: speed.factor=0"), ("5", "event=5: write pause:100"),
+    (["pause:5", "pause:5"], "each once"), (7, "event=7"),
 ])  # fmt: skip
 def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match=words) as caught:
         event_arms(arm)
+    assert str(caught.value).startswith("event=")
 
 
 def test_events_of_no_length_equal_the_baseline_run_to_the_last_bit(policy: MMEPolicy) -> None:
