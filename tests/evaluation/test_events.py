@@ -19,7 +19,7 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
-from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
+from mme_vla.evaluation.results.events import event_curves, event_table, idle_events, matched_methods
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
 from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
@@ -275,6 +275,7 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
     ]  # fmt: skip
     rows = {row[1]: row[3:] for row in event_table(made).rows}
     assert rows["pause:50"] == ["4", "75.0", "50.0", "1", "2", "1", "1.000", "0"]
+    assert idle_events(made) == ["event=pause:50@subtask:9 did not act in 4 episodes: its place never came."]
     assert rows["pause:50@subtask:9"][-1] == "4" and rows["speed:2"][:3] == ["2", "100.0", "50.0"]
     curves = {dial: [(p.turned, p.won, p.episodes) for p in points] for (_, _, dial), points in
               event_curves(made).items()}  # fmt: skip

@@ -1,5 +1,6 @@
 """Runs with events beside their matched arms, the same scenes and noise without: pairs, and success over length."""
 
+from collections import Counter
 from collections.abc import Sequence
 
 from mme_vla.errors import require
@@ -44,6 +45,12 @@ def matched_pairs(records: Sequence[EpisodeRecord]) -> dict[RunKey, list[Pair]]:
 def did_not_act(record: EpisodeRecord) -> list[str]:
     """The events of a record whose place never came: a sub-task that did not begin, a step beyond the end."""
     return [entry["event"] for entry in record.extra.get("events", ()) if entry["step"] is None]
+
+
+def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
+    """A line for each event that did not act in some episodes."""
+    counts = Counter(event for record in records if record.outcome != "error" for event in did_not_act(record))
+    return [f"event={event} did not act in {count} episodes: its place never came." for event, count in counts.items()]
 
 
 def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
