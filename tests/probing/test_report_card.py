@@ -161,15 +161,16 @@ def test_the_score_is_undefined_where_both_losses_lie_within_noise() -> None:
 
 
 def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
-    def moments(name: str, changes: list[float]) -> list[MomentLine]:
+    def moments(name: str, changes: list[float], spread: float = 0.1) -> list[MomentLine]:
         return [
-            MomentLine(name, "VideoUnmask", 16 * i, 0, "", "distract:1", 1.0, 4, [], change, 0.1, 0.0)
+            MomentLine(name, "VideoUnmask", 16 * i, 0, "", "distract:1", 1.0, 4, [], change, spread, 0.0)
             for i, change in enumerate(changes)
         ]
 
     lines = moments("a", [0.0, 0.5, 0.1, 0.0]) + moments("b", [0.1, 0.0, 0.0, 0.0]) + moments("c", [0.5, 0, 0, 0.5])
     assert recovery(lines) == Recovery(2.0, 2, 3, 4.0)
     assert recovery(moments("c", [0.0, 0.5])) == Recovery(None, 0, 1, 2.0)
+    assert recovery(moments("d", [0.5, 1e-4, 0.0], spread=0.0)) == Recovery(1.0, 1, 1, 3.0), "a policy without noise"
     assert recovery([]) is None
 
 
