@@ -149,7 +149,7 @@ def run_card(
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
     evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, shard=plan.shard, source=plan.source, **how)
     recovered = None
-    if plan.recordings and len(plan.lend) > 1:
+    if plan.recordings and len(plan.lend) > 1 and WRONG_SCENE in possible:
         offline = replace(plan.offline, moments=None, scan=False)
         wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
