@@ -4,7 +4,6 @@ import logging
 import multiprocessing
 import os
 import sys
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -185,12 +184,12 @@ def report(done: "Evaluation", output: Path) -> None:
 
 def report_events(done: "Evaluation", width: int) -> None:
     """Say what events changed, and where one did not act."""
-    from mme_vla.evaluation.results.events import did_not_act, event_table
+    from mme_vla.evaluation.results.events import event_table, idle_events
     from mme_vla.evaluation.results.tables import print_table
 
     print_table(event_table([*done.records, *done.matched], "first"), width)
-    for event, count in Counter(event for record in done.records for event in did_not_act(record)).items():
-        logger.warning("event=%s did not act in %d episodes: its place never came", event, count)
+    for line in idle_events(done.records):
+        logger.warning(line)
 
 
 def report_usage(usage: "Usage") -> None:

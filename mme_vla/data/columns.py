@@ -1,20 +1,40 @@
 """Further columns of a dataset: labels and weights of samples (numbers), and notes of a prompt (texts)."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+import torch
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import parquet_files
 from mme_vla.errors import UserError, check_known, listed, require
+from mme_vla.types import HistoryTokens, Labels
 
 BOUNDARY = "subtask_boundary"
 """The label that is 1 at the first frame of every sub-task and 0 elsewhere, from the column `simple_subgoal`."""
 SUBTASK = "subtask_index"
 """The label that counts the sub-tasks that have begun in an episode so far, from 1."""
+
+
+def with_labels(
+    selection: HistoryTokens, labels: Mapping[str, Callable[[np.ndarray], np.ndarray]], real: np.ndarray | None = None
+) -> HistoryTokens:
+    """A selection, unbatched, with the labels of each token's frame.
+
+    labels: name → values [n] or [n, k] float32 of an episode's frames [n]. real: the recorded frame of each frame of a
+    transformed episode (`FrameMap.real`).
+    """
+    frames = (selection.positions[:, 0] * selection.mask).numpy().astype(np.int64)
+    tokens = Labels()
+    for name, read in labels.items():
+        values = torch.from_numpy(read(frames if real is None else real[frames]))
+        tokens[name] = values * selection.mask.view(-1, *[1] * (values.ndim - 1))
+    return replace(selection, labels=tokens)
 
 
 def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The training dataset: one item is one step of an execution phase."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache import VisionCache
-from mme_vla.data.columns import label_column, text_column, weight_column
+from mme_vla.data.columns import label_column, text_column, weight_column, with_labels
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, listed, require
 from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
@@ -21,7 +21,7 @@ from mme_vla.processing.base import PolicyProcessor, Sample, motion_rows
 from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
 from mme_vla.processing.prompt import SubgoalText
-from mme_vla.types import HistoryTokens, Labels, labels_read
+from mme_vla.types import labels_read
 
 TRANSFORMS = 1  # The stream of random numbers of an item that transforms read
 
@@ -77,20 +77,13 @@ class FurtherColumns:
         (row,) = self._source.rows(episode, np.array([frame]))
         return str(self._texts[note][int(row)].as_py())
 
-    def with_labels(self, episode: int, selection: HistoryTokens, real: np.ndarray | None = None) -> HistoryTokens:
-        """A selection, unbatched, with the labels of each token's frame that the memory reads.
+    def of_memory(self, episode: int) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+        """The labels that the memory reads, by name: values of an episode's frames [n]."""
+        return {name: partial(self._values, name, episode) for name in self._memory_labels}
 
-        real: the recorded frame of each frame of a transformed episode (`FrameMap.real`).
-        """
-        if not self._memory_labels:
-            return selection
-        frames = (selection.positions[:, 0] * selection.mask).numpy()
-        rows = self._source.rows(episode, frames if real is None else real[frames.astype(np.int64)])
-        labels = Labels()
-        for name in self._memory_labels:
-            values = torch.from_numpy(self._labels[name][rows])
-            labels[name] = values * selection.mask.view(-1, *[1] * (values.ndim - 1))
-        return replace(selection, labels=labels)
+    def _values(self, name: str, episode: int, frames: np.ndarray) -> np.ndarray:
+        values: np.ndarray = self._labels[name][self._source.rows(episode, frames)]
+        return values
 
 
 class TrainingDataset(Dataset[dict[str, Any]]):
@@ -304,7 +297,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                 history = TransformedHistory(history, frames)
             selection = self.memory.gather_selection(history, now, rng if self.jitter else None)
             real = None if frames is None else frames.real
-            item["history"] = self.columns[step.source].with_labels(step.episode, selection, real)
+            item["history"] = with_labels(selection, self.columns[step.source].of_memory(step.episode), real)
             if (spec := past_view_spec(self.memory)) is not None:
                 read = partial(self._images, step.source, step.episode, frames)
                 item["past"] = past_views(spec, now, read, self.processor.images)

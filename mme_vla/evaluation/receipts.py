@@ -1,5 +1,7 @@
 """Receipts: what a third person needs to check a score, in one JSON beside each file of records."""
 
+import hashlib
+import lzma
 import platform
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -70,8 +72,8 @@ def verify(path: Path, checkpoint: Path | None = None) -> tuple[list[str], list[
     """Check a receipt offline: recompute the digests of the files that are here, compare versions of what is installed.
 
     Args:
-        path: of the receipt; its records and `run.json` are beside it. checkpoint: where the checkpoint is, if not at
-            the place that the receipt names.
+        path: of the receipt; its records, or these as `.xz`, and `run.json` are beside it.
+        checkpoint: where the checkpoint is, if not at the place that the receipt names.
 
     Returns:
         What differs, and what could not be compared or is another machine's.
@@ -83,13 +85,14 @@ def verify(path: Path, checkpoint: Path | None = None) -> tuple[list[str], list[
     else:
         notes.append(f"{RUN_FILE} is not beside the receipt: the settings are the receipt's word alone.")
     records = folder / content["records"]["file"]
+    records = records if records.is_file() else records.with_name(f"{records.name}.xz")
     if records.is_file():
         score = to_json(_score(records, settings))
         for key in ("records", "score", "scenes"):
             differences += _differences(key, content[key], score[key])
         differences += _other_scenes(read_records(records), settings)
     else:
-        differences.append(f"records: {records.name} is not beside the receipt.")
+        differences.append(f"records: {content['records']['file']} is not beside the receipt, nor {records.name}.")
     for part in content["conditions"]:
         here = _conditions(part["hardware"]["gpu"] is not None, part["renderer"] is not None)
         for key in ("code", "simulator", "renderer", "libraries"):
@@ -110,11 +113,16 @@ def verify(path: Path, checkpoint: Path | None = None) -> tuple[list[str], list[
 
 
 def _score(records: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Outcomes of each task, and digests of the records and of their scenes."""
+    """Outcomes of each task, and digests of the records, uncompressed, and of their scenes."""
     lines = read_records(records) if records.exists() else []
+    name, total = records.name.removesuffix(".xz"), None
+    if records.exists():
+        content = records.read_bytes()
+        content = lzma.decompress(content) if records.suffix == ".xz" else content
+        total = hashlib.sha256(content).hexdigest()
     tasks = dict.fromkeys(record.task for record in lines)
     return {
-        "records": {"file": records.name, "sha256": file_sum(records) if records.exists() else None},
+        "records": {"file": name, "sha256": total},
         "scenes": _scenes(lines, settings["split"]),
         "score": {task: count_outcomes(line for line in lines if line.task == task) for task in tasks},
     }

@@ -96,19 +96,22 @@ class Recording:
     def show(
         self, running: Any, start: int, stop: int, required: np.ndarray | None = None, video: bool = False
     ) -> None:
-        """Observe frames start … stop − 1 in a running episode.
+        """Observe frames start … stop − 1 in a running episode, which then offers the options that were recorded.
 
-        required: as for `views`. video: all of it as if it were a conditioning video.
+        required: as for `views`. video: all of it as if it were a conditioning video of that episode.
         """
         if stop <= start:
             return
+        if not video:
+            running.options = self.source.options(self.episode)
         views, rendered = self.views(start, stop, required)
         frames = np.arange(start, stop)
         executed = frames[frames >= self.exec_start]
         if video:
             actions = None
         elif self.source.robot.action.frames is None:
-            actions = self.source.past_actions(self.episode, stop - 1, self.length)
+            n_observed = len(self.source.past_actions(self.episode, start - 1, self.length))
+            actions = self.source.past_actions(self.episode, stop - 1, self.length)[n_observed:]
         else:
             actions = self.source.actions(self.episode)[np.maximum(executed - 1, 0)]
         demo = np.ones(len(frames), bool) if video else frames < self.exec_start

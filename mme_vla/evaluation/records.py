@@ -33,7 +33,8 @@ class RunKey(NamedTuple):
         name = name if self.memory_budget is None else f"{name}, {self.memory_budget} memory tokens"
         trained = ""
         if self.training is not None:
-            trained = f", training seed {self.training.seed} of recipe {str(self.training.recipe)[:6]}"
+            seed = "" if self.training.seed is None else f"training seed {self.training.seed} of "
+            trained = f", {seed}recipe {str(self.training.recipe)[:6]}"
         happens = f", event {self.event}" if self.event else ""
         return f"{name}{trained}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}{happens}"
 

@@ -36,7 +36,8 @@ class Demonstration:
 
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
     subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
-    time. images: camera → frame → [256, 256, 3] uint8.
+    time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which a sub-task begins, of the video too;
+    None in files of earlier versions.
     """
 
     task: str
@@ -49,12 +50,15 @@ class Demonstration:
     motions: Motions
     images: dict[str, dict[int, np.ndarray]]
     subgoals: dict[str, list[str]] = field(default_factory=dict)
+    boundaries: np.ndarray | None = None
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
         names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals")
         about = {name: getattr(self, name) for name in names}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
+        if self.boundaries is not None:
+            arrays["boundaries"] = self.boundaries
         for camera, taken in self.images.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
             arrays[f"{camera}_pictures"] = np.stack(list(taken.values()))
@@ -72,7 +76,8 @@ class Demonstration:
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
-            return cls(**about, states=file["states"], motions=motions, images=loaded_images)
+            boundaries = file.get("boundaries")
+            return cls(**about, states=file["states"], motions=motions, images=loaded_images, boundaries=boundaries)
 
 
 @dataclass(frozen=True)
@@ -181,6 +186,7 @@ def record(
         return Demonstration(
             type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
             np.stack(taken.states), motions, images, {kind: _subgoal_texts(texts, kind) for kind in SUBGOALS},
+            _boundaries(taken.texts),
         )  # fmt: skip
     finally:
         env.close()
@@ -279,3 +285,9 @@ def _subgoal_texts(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
     for text in texts:
         result.append(online_subgoal(text, kind) or (result[-1] if result else ""))
     return result
+
+
+def _boundaries(texts: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """Frames at which a sub-task begins: where the recorded subgoal changes, as in `data.columns`."""
+    subgoals = [text.get("simple_subgoal", text.get("simple_subgoal_online")) for text in texts]
+    return np.array([i for i, text in enumerate(subgoals) if not i or text != subgoals[i - 1]], np.int64)

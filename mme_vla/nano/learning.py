@@ -1,6 +1,7 @@
 """Training on demonstrations of motions or choices: every decision is a sample, of tokens made beforehand."""
 
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.backbone.siglip import pool_grid
+from mme_vla.data.columns import BOUNDARY, SUBTASK, with_labels
 from mme_vla.embodiment.action_space import MIDDLE
 from mme_vla.errors import require
 from mme_vla.memory.base import Memory, stack_history, uses_proprio
@@ -22,9 +24,17 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
-from mme_vla.types import Batch, HistoryTokens, stack_noise
+from mme_vla.types import Batch, HistoryTokens, Labels, labels_read, stack_noise
+
+logger = logging.getLogger(__name__)
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
+OLD_FILES = (
+    "Demonstrations of an earlier version name no sub-tasks: the memory learns without its loss on them. Remove their "
+    "files, and record them again, for that loss."
+)
+FrameLabels = Mapping[str, Callable[[np.ndarray], np.ndarray]]
+"""Name of a label → its values [n] at frames [n]."""
 JOINT_NOISE = 0.05
 VIEW_NOISE = 0.25  # on tokens of current images: what points at an object reads its place there
 MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
@@ -62,11 +72,11 @@ class SparseHistory(History):
 class Replay:
     """What a memory selects from in a demonstration whose frames are transformed, anew in each epoch.
 
-    rows: for each decision its history and its frame.
+    rows: for each decision its history, its frame, and the labels of its demonstration.
     """
 
     memory: Memory
-    rows: Sequence[tuple[History, int]]
+    rows: Sequence[tuple[History, int, FrameLabels]]
     transforms: Sequence[HistoryTransform]
     seed: int
 
@@ -74,11 +84,12 @@ class Replay:
         """The selections of these decisions, each a function of (seed, epoch, row)."""
         items = []
         for row in rows:
-            history, frame = self.rows[row]
+            history, frame, labels = self.rows[row]
             rng = np.random.default_rng([self.seed, epoch, row])
             visible = map_frames(self.transforms, frame + 1, history.exec_start, rng, keep=[frame])
             now = int(visible.transformed(np.array(frame)))
-            items.append(self.memory.gather_selection(TransformedHistory(history, visible), now))
+            selection = self.memory.gather_selection(TransformedHistory(history, visible), now)
+            items.append(with_labels(selection, labels, visible.real))
         return stack_history(items)
 
 
@@ -131,7 +142,7 @@ class Decisions(Dataset[int]):
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
-        rows: list[tuple[History, int]] = []
+        rows: list[tuple[History, int, FrameLabels]] = []
         tasks: list[str] = []
         for entry in demonstrations:
             demonstration, made = (entry, tokenize(policy, entry)) if isinstance(entry, Demonstration) else entry
@@ -140,9 +151,14 @@ class Decisions(Dataset[int]):
             items += new
             tasks += [demonstration.task] * len(new)
             if history is not None and transforms:
-                rows += [(history, frame) for frame in _decisions(policy, demonstration)]
+                labels = _labels(policy.require_memory(), demonstration)
+                rows += [(history, frame, labels) for frame in _decisions(policy, demonstration)]
             distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
         require(items, "The demonstrations hold no decision to learn from.")
+        if labels_read(policy.memory) and not all(item["history"].labels for item in items):
+            logger.warning(OLD_FILES)
+            items = [item | {"history": replace(item["history"], labels=Labels())} for item in items]
+            rows = [(history, frame, {}) for history, frame, _ in rows]
         replay = Replay(policy.require_memory(), rows, transforms, seed) if rows else None
         return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), tasks, replay=replay, **options)
 
@@ -278,7 +294,8 @@ def _items(
             "action_mask": torch.from_numpy(recorded),
         }  # fmt: skip
         if history is not None:
-            item["history"] = policy.require_memory().gather_selection(history, frame)
+            selection = policy.require_memory().gather_selection(history, frame)
+            item["history"] = with_labels(selection, _labels(policy.require_memory(), demonstration))
         items.append(item)
     return items
 
@@ -308,6 +325,18 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
         )
         history.motion, history.state_width = motion.__getitem__, policy.embodiment.state.width
     return history
+
+
+def _labels(memory: Memory, demonstration: Demonstration) -> FrameLabels:
+    """The labels of sub-tasks that a memory reads; none where the demonstration names no sub-tasks."""
+    begins = demonstration.boundaries
+    if begins is None:
+        return {}
+    known: FrameLabels = {
+        SUBTASK: lambda frames: np.searchsorted(begins, frames, side="right").astype(np.float32),
+        BOUNDARY: lambda frames: np.isin(frames, begins).astype(np.float32),
+    }
+    return {name: known[name] for name in labels_read(memory) if name in known}
 
 
 def _subgoals(policy: MMEPolicy, demonstration: Demonstration) -> Sequence[str | None]:

@@ -37,6 +37,8 @@ ARMS = {
     "nothing remembered": "drop:all", "oracle frames": "oracle",
 }  # fmt: skip
 """What a card measures in closed loop beside the matched run, and the interventions that do it."""
+NEGLIGIBLE = 0.01
+"""Change of a chunk, in normalised actions, that misleads no policy: one without noise has a spread of 0."""
 AGAIN, PAGE, FIGURES = "again", "card.html", "card.json"
 _SAMPLES, _TAILS = 10_000, (0.025, 0.975)
 _HOW = (
@@ -46,7 +48,7 @@ _HOW = (
     "The memory-or-clock score is the loss under time shift / (that loss + the loss under content swap): 1 where a "
     "policy reads only time, 0 where it reads only content. It is undefined where both losses lie within noise.",
     "Recovery counts, on recorded episodes before which another scene is seen, the decisions until the chunk never "
-    "again changes by more than the policy's own spread.",
+    f"again changes by more than the policy's own spread, or {NEGLIGIBLE} where the spread is less.",
 )
 
 
@@ -81,8 +83,8 @@ class Recovery:
     """Decisions until a policy that saw another scene first acts as without it, on recorded episodes.
 
     A recording has recovered at the first decision from which on the chunk never changes by more than the policy's own
-    spread. median: over the recordings; None where at least half of them do not recover. recovered: those that do.
-    decisions: mean number of decisions of a recording.
+    spread, or `NEGLIGIBLE` where that is more. median: over the recordings; None where at least half of them do not
+    recover. recovered: those that do. decisions: mean number of decisions of a recording.
     """
 
     median: float | None
@@ -147,7 +149,7 @@ def run_card(
     renamed = replace(facts, model=f"{facts.model} · {AGAIN}", model_seed=again.seed)
     evaluate(policy, plan.jobs, folder / AGAIN, renamed, again, shard=plan.shard, source=plan.source, **how)
     recovered = None
-    if plan.recordings and len(plan.lend) > 1:
+    if plan.recordings and len(plan.lend) > 1 and WRONG_SCENE in possible:
         offline = replace(plan.offline, moments=None, scan=False)
         wrong = replace(plan, arms=[ARMS[WRONG_SCENE]], jobs=(), offline=offline)
         run_probe(policy, wrong, folder, facts, settings, show_progress=show_progress)
@@ -212,7 +214,7 @@ def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
     """How long the wrong scene has an effect. moments: of one arm, at every decision of each recording."""
     misled: dict[str, list[bool]] = {}
     for line in sorted(moments, key=lambda line: line.step):
-        misled.setdefault(line.recording, []).append(line.change > line.spread)
+        misled.setdefault(line.recording, []).append(line.change > max(line.spread, NEGLIGIBLE))
     if not misled:
         return None
     last = [max(np.flatnonzero(flags), default=-1) for flags in misled.values()]

@@ -18,6 +18,7 @@ from mme_vla.evaluation.recordings import Recording, all_recordings
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, evaluate_events, facts_of
 from mme_vla.evaluation.rollout.events import event_arms
@@ -111,6 +112,7 @@ def run_probe(
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
     comparisons = _paired(records, facts.split, facts.model)
+    notes += idle_events(records)
     write_images(findings, plan.recordings, folder)
     return Probe(findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes))
 

@@ -165,7 +165,7 @@ class TokenlessHistory(CachedHistory):
 
     def gather(self, indices: np.ndarray) -> torch.Tensor:
         raise TokensReadError(
-            "This memory reads vision tokens to choose its frames: name a policy that makes them (--checkpoint)."
+            "This memory reads vision tokens to choose its frames: name a checkpoint that has it with --checkpoint."
         )
 
 

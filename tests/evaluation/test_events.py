@@ -18,13 +18,15 @@ from mme_vla.envs.base import Environment, EpisodeEnv, Hold
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import aggregate
-from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
+from mme_vla.evaluation.results.aggregate import Interval, aggregate, wilson
+from mme_vla.evaluation.results.curves import distinct_parts
+from mme_vla.evaluation.results.events import event_curves, event_table, idle_events, matched_methods
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
 from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RecordLog
+from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import EVENTS
 from mme_vla.testing.small import cached_history
@@ -78,15 +80,20 @@ def test_events_are_read_from_one_word() -> None:
 
 
 @pytest.mark.parametrize(("arm", "words"), [
-    ("pause:-5", "event.pause.steps=-5 must be a whole number, 0 or more"), ("pause:1.5", "event.pause.steps=1.5"),
-    ("paus:5", "Unknown event 'paus'. Did you mean 'pause'"), ("pause:5@subtsk:2", "place='subtsk'.*subtask"),
+    ("pause:-5", "event=pause:-5: pause.steps=-5 must be a whole number, 0 or more"),
+    ("pause:1.5", "event=pause:1.5: pause.steps=1.5"), ("gap:-1", "event=gap:-1: gap.frames=-1"),
+    ("paus:5", "event=paus:5: name='paus'. Did you mean 'pause'"),
+    ("pause:5@subtsk:2", "event=pause:5@subtsk:2: place='subtsk'.*subtask"),
+    ("pause:5@subtask:pick", "event=pause:5@subtask:pick: write pause:100"),
     ("pause:5@subtask:0", "subtask:0 must be 1 or more"), ("pause:5@step:-1", "step:-1 must be 0 or more"),
-    ("speed:2@step:4", "takes no place"), ("restart:4", "takes no number"), ("speed:0", "event.speed.factor=0"),
-    ("5", "event=5: write pause:100"), (["pause:5", "pause:5"], "each once"), (7, "event=7"),
+    ("speed:2@step:4", "takes no place"), ("restart:4", "takes no number"),
+    ("speed:0", "event=speed:0: speed.factor=0"), ("5", "event=5: write pause:100"),
+    (["pause:5", "pause:5"], "each once"), (7, "event=7"),
 ])  # fmt: skip
 def test_what_is_no_event_is_refused_with_its_key(arm: Any, words: str) -> None:
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match=words) as caught:
         event_arms(arm)
+    assert str(caught.value).startswith("event=")
 
 
 def test_events_of_no_length_equal_the_baseline_run_to_the_last_bit(policy: MMEPolicy) -> None:
@@ -269,8 +276,9 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
         *under("speed:2", [1, 0]), *under("pause:50@subtask:9", [1, 1, 1, 0], never),
     ]  # fmt: skip
     rows = {row[1]: row[3:] for row in event_table(made).rows}
-    assert rows["pause:50"] == ["4", "75.0", "50.0", "1", "2", "1", "1.000", "0"]
-    assert rows["pause:50@subtask:9"][-1] == "4" and rows["speed:2"][:3] == ["2", "100.0", "50.0"]
+    assert rows["pause:50"] == ["1", "4", "75.0", "50.0", "1", "2", "1", "1.000", "0"]
+    assert idle_events(made) == ["event=pause:50@subtask:9 did not act in 4 episodes: its place never came."]
+    assert rows["pause:50@subtask:9"][-1] == "4" and rows["speed:2"][:4] == ["1", "2", "100.0", "50.0"]
     curves = {dial: [(p.turned, p.won, p.episodes) for p in points] for (_, _, dial), points in
               event_curves(made).items()}  # fmt: skip
     assert curves["pause"] == [(0, 2, 2), (50, 1, 2), (100, 0, 2)] and curves["speed"] == [(1, 2, 2), (2, 1, 2)]
@@ -286,6 +294,21 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
     assert "Events beside their matched arms" in capsys.readouterr().out and "PickXtimes, pause" in page.read_text()
     with pytest.raises(UserError, match="None of these records is of an event"):
         event_table(records("test", [1]))
+
+
+def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
+    won = {None: ([1, 1, 1, 1], [1, 1, 0, 0]), "pause:64": ([0, 0, 0, 1], [1, 0, 1, 0])}
+    made = [
+        replace(record, training=TrainingIdentity(seed, "recipe", "data", f"w{seed}"))
+        for event, outcomes in won.items() for seed, part in enumerate(outcomes) for record in under(event, part)
+    ]  # fmt: skip
+    (row,) = event_table(made).rows
+    assert row[2:] == ["PickXtimes", "2", "8", "75.0 ± 35.4", "37.5 ± 17.7", "2", "4", "1", "0.375", "0"]
+    assert row[0] == "m, recipe recipe, checkpoint 1, seed 7, test"
+    (points,) = event_curves(made).values()
+    assert [(p.turned, p.won, p.episodes) for p in points] == [(0, 6, 8), (64, 3, 8)]
+    assert distinct_parts(["m, recipe a, seed 7", "m, recipe b, seed 7"]) == ["recipe a", "recipe b"]
+    assert points[0].interval == Interval(*(100 * bound for bound in wilson(0.75, 4, 0.95))), "of four scenes"
 
 
 def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(

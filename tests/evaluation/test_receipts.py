@@ -1,6 +1,7 @@
 """A receipt agrees with the run it is of, and names what differs from it."""
 
 import json
+import lzma
 import shutil
 from pathlib import Path
 
@@ -56,6 +57,10 @@ def test_a_receipt_agrees_with_its_run(checkpoint: Path, tmp_path: Path, capsys:
     )
     main(["verify", str(tmp_path)])
     assert "agrees" in capsys.readouterr().out
+    records = tmp_path / "episodes.jsonl"
+    records.with_name("episodes.jsonl.xz").write_bytes(lzma.compress(records.read_bytes()))
+    records.unlink()
+    assert receipts.verify(path) == ([], []), "as records are published"
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "norm_stats.json"])

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import make_moving_env
-from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.envs import Job
 from mme_vla.evaluation.recordings import Recording
 from mme_vla.policy.mme import MMEPolicy
@@ -38,6 +38,15 @@ class MadeUpSource:
 
     def goal(self, episode: int) -> str:
         return f"pick up the cube number {episode}"
+
+    def options(self, episode: int) -> tuple[Option, ...]:
+        offered = Option("a", f"pick up cube {episode}", True), Option("c", "drop it")
+        return offered if self.robot.action.choice else ()
+
+    def past_actions(self, episode: int, start: int, most: int) -> np.ndarray:
+        """One motion a frame of the execution, all of its numbers that frame's."""
+        frames = np.arange(self.exec_starts[episode], max(start, self.exec_starts[episode]))
+        return np.repeat(frames[-most:, None], self.robot.action.width, 1).astype(np.float32)
 
     def decisions(self, episode: int) -> range:
         return range(int(self.exec_starts[episode]), int(self.lengths[episode]))

@@ -5,7 +5,9 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from mme_vla.config.composition import config_dir
 from mme_vla.errors import UserError
 from mme_vla.memory.base import FeatureEncoder, Memory, stack_history
 from mme_vla.memory.transforms import RepeatFrame, TransformedHistory, map_frames
@@ -16,7 +18,9 @@ from mme_vla.types import HistoryTokens
 WITH_POSITIONS: dict[str, dict[str, Any]] = {
     "framesamp": {"budget": 64}, "tokendrop": {"budget": 64, "grid": 4}, "retrieval": {"budget": 64},
     "ttt": {"budget": 16, "grid": 4}, "rmt": {"budget": 16, "grid": 4}, "gist": {"budget": 128},
-    "learned_topk": {"budget": 32, "pool": 8, "grid": 4}, "moment": {}, "actions": {"budget": 4},
+    "learned_topk": {"budget": 32, "pool": 8, "grid": 4}, "moment": {}, "actions": {"budget": 4}, "present": {},
+    "anchors": {"budget": 48}, "events": {"budget": 64}, "pyramid": {"budget": 80},
+    "keyframes": {"budget": 48, "pool": 8},
 }  # fmt: skip
 
 OTHERS: dict[str, dict[str, Any]] = {
@@ -54,6 +58,12 @@ def test_tokens_say_of_their_place_what_positions_allows(name: str) -> None:
         ("time_space", "time"): True, ("time_space", "space"): True, ("space", "time"): False,
         ("space", "space"): True, ("none", "time"): False, ("none", "space"): False,
     }  # fmt: skip
+
+
+def test_every_memory_whose_tokens_have_positions_has_the_key() -> None:
+    sections = {path.stem: OmegaConf.load(path) for path in (config_dir() / "memory").glob("*.yaml")}
+    assert {*sections} == {*WITH_POSITIONS, *OTHERS, "none"}
+    assert {name for name, section in sections.items() if "positions" in section} == {*WITH_POSITIONS}
 
 
 def test_without_positions_there_is_no_position_layer_and_a_narrower_encoder() -> None:

@@ -13,12 +13,14 @@ from mme_vla import UserError
 from mme_vla.backbone.tower import CLASSES, by_class, summarise
 from mme_vla.cli import nano as nano_command
 from mme_vla.cli.nano import with_settings
+from mme_vla.memory.transforms import RepeatFrame
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.nano.runs import counts_of
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.run_folders import SHIPPED, resolve_checkpoint
 from mme_vla.testing import check_backbone
+from mme_vla.types import Batch
 
 SMALL = {
     "vision": {"image_size": 32, "width_32": 8, "width_16": 8, "width_8": 8, "pretrained": False},
@@ -32,12 +34,37 @@ def test_it_keeps_a_backbones_contract() -> None:
 
 
 def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
-    made = demonstration()
+    made = replace(demonstration(), boundaries=np.array([0, 66]))
     made.save(tmp_path / "a.npz")
     read = Demonstration.load(tmp_path / "a.npz")
     assert (read.goal, read.length, read.exec_start) == (made.goal, made.length, made.exec_start)
+    assert read.boundaries is not None and read.boundaries.tolist() == [0, 66]
     assert np.array_equal(read.motions.targets, made.motions.targets) and read.subgoals == made.subgoals
     assert list(read.images) == ["front"] and np.array_equal(read.images["front"][66], made.images["front"][66])
+
+
+def test_a_memory_learns_from_the_sub_tasks_of_demonstrations(caplog: pytest.LogCaptureFixture) -> None:
+    policy = nano("keyframes_modul", memory={"budget": 4, "grid": 1, "every": 8, "pool": 8})
+    read = policy.frames_read(np.array([66, 120, 155]), 66).tolist()
+    made = replace(demonstration(tuple(sorted({*read, 66, 120, 155}))), boundaries=np.array([0, 30, 66, 121]))
+    policy.require_processor().stats = statistics([made], policy)
+
+    def labels(batch: Batch, begins: tuple[int, ...] = (0, 30, 66, 121)) -> tuple[list[float], list[float]]:
+        """What is learned, and what the times of the tokens would say."""
+        assert batch.history is not None
+        valid = batch.history.mask[0]
+        naive = (batch.history.positions[0, valid, :1] >= torch.tensor(begins)).sum(1)
+        return batch.history.labels["subtask_index"][0, valid].tolist(), naive.tolist()
+
+    learned, naive = labels(Decisions.of(policy, [made]).collate([2]))
+    assert learned == naive and set(learned) == {1, 2, 3, 4}
+    batch = Decisions.of(policy, [made], transforms=[RepeatFrame(400)]).collate([2])
+    learned, naive = labels(batch)
+    assert learned != naive and learned == sorted(learned) and learned[-1] == 4, "of the recorded frames"
+    assert "losses/write" in policy.train()(batch, policy.training_noise(1, torch.Generator().manual_seed(0)))[1]
+    assert not caplog.messages
+    old = Decisions.of(policy, [made, replace(made, boundaries=None)])
+    assert not old.collate([0, 5]).history.labels and "record them again" in caplog.text
 
 
 def test_a_frame_that_was_not_rendered_is_refused() -> None:

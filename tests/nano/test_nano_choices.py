@@ -22,4 +22,5 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
     assert letters == "abbbbcd"
     across = made.motions.targets[1:5, 9]
     assert across[0] == across[2] < across[1] == across[3]  # right of the robot is left in the image
+    assert made.boundaries is not None and len(made.boundaries) == len(letters) + 1, "after the last one it is over"
     assert set(made.motions.decisions.tolist()) == set(made.images["front"])

@@ -1,12 +1,13 @@
 """Interventions reach every kind of policy that remembers, and show it what they say."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.probe_fakes import made_up
+from helpers.probe_fakes import made_up, probed
 from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
@@ -14,7 +15,9 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.probing.channels import channel_of
+from mme_vla.probing.lines import MomentLine
 from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
+from mme_vla.processing.normalise import NormStats
 from mme_vla.testing.small import unit_stats
 
 JOINED: list[dict[str, Any]] = [{"name": "framesamp", "budget": 64}, {"name": "ttt", "budget": 64}]
@@ -38,6 +41,17 @@ def memoryvla() -> Any:
     return policy.eval()
 
 
+def by_choices() -> Any:
+    policy: Any = build_policy(
+        "framesamp_modul", backbone="nano_choice", **{"backbone.point": "regression"},
+        embodiment="robomme_choice_front", memory={"budget": 4, "grid": 1},
+    )  # fmt: skip
+    policy.require_processor().stats = NormStats.unit(8, 10)
+    for parameter in policy.integration.parameters():  # as above: a fresh modulator changes nothing
+        torch.nn.init.normal_(parameter, std=0.3, generator=torch.Generator().manual_seed(0))
+    return policy.eval()
+
+
 KINDS = {
     "perceptual": lambda: quick_policy("framesamp_expert", 8).eval(),
     "by change": lambda: quick_policy("tokendrop_context", 8).eval(),
@@ -45,6 +59,7 @@ KINDS = {
     "joined": lambda: quick_policy("pi05", 8, memory=JOINED, integration="context").eval(),
     "film": diffusion_with_memory,
     "bank": memoryvla,
+    "by choices": by_choices,
 }
 
 
@@ -92,6 +107,22 @@ def test_probe_frames_equal_manually_composed_ones(kind: str) -> None:
         by_hand[name] = policy.act(episode, 2)
     for name, expected in by_hand.items():
         assert np.array_equal(chunks(policy, name)[1][0], expected), name
+
+
+def test_a_policy_by_choices_reads_the_recorded_options_and_each_motion_once(tmp_path: Path) -> None:
+    policy, goals = by_choices(), set()
+    prompt = policy.processor.prompt
+    policy.processor.prompt = lambda goal, **others: (goals.add(goal), prompt(goal, **others))[1]
+    lines = probed(policy, ["distract:1", "swap"], tmp_path, moments=3)
+    assert {line.arm for line in lines if isinstance(line, MomentLine)} == {"distract:1", "swap"}
+    assert goals == {"pick up the cube number 0. Options: a pick up cube 0 (point), c drop it"}
+
+    policy = quick_policy("pi05_past_actions", 8, embodiment="robomme_choice_front")
+    recording = made_up(robot=policy.embodiment)[0]
+    episode = policy.start_episode(recording.goal)
+    for start, stop in ((0, 21), (21, 25), (25, 27)):
+        recording.show(episode, start, stop)
+    assert episode._executed[:, 0].tolist() == [20, 21, 22, 23, 24, 25]
 
 
 def test_a_pause_is_a_frame_repeated() -> None:

@@ -29,7 +29,8 @@ def probe_both(folder: Path, **settings: object) -> Probe:
     policy = quick_policy("framesamp_modul").eval()
     recordings = made_up()
     offline = OfflineSettings(1, 2, 1, True, 2)
-    request = ProbePlan(["shuffle", "nodemo"], recordings[:1], recordings, JOBS, offline, events=["pause:4"])
+    events = ["pause:4", "pause:4@step:99"]
+    request = ProbePlan(["shuffle", "nodemo"], recordings[:1], recordings, JOBS, offline, events=events)
     settings_ = RolloutSettings(max_steps=24, flow_steps=2, workers=1, max_batch=1, **settings)
     return run_probe(policy, request, folder, FACTS, settings_, base=make_moving_env, show_progress=False)
 
@@ -37,15 +38,16 @@ def probe_both(folder: Path, **settings: object) -> Probe:
 def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(tmp_path: Path) -> None:
     findings = probe_both(tmp_path)
     arms = {named("tiny", read_arm(w)) for w in ("shuffle", "nodemo")}
-    assert {c.first for c in findings.comparisons} == {*arms, "tiny · pause:4"}
+    assert {c.first for c in findings.comparisons} == {*arms, "tiny · pause:4", "tiny · pause:4@step:99"}
     assert all(c.second == "tiny" and c.episodes == 2 for c in findings.comparisons)
+    assert findings.notes == ["event=pause:4@step:99 did not act in 2 episodes: its place never came."]
     assert set(findings.findings.arms()) == {"shuffle", "nodemo"}
     page = findings.page.read_text()
     for words in ("Decay with distance", "In closed loop", "tiny · shuffle", "data:image/webp;base64,"):
         assert words in page
     assert "<script" not in page and 'src="http' not in page and 'href="http' not in page
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
-    assert len(before) == 5
+    assert len(before) == 6
     again = probe_both(tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")} == before
     assert again.findings == findings.findings

@@ -20,6 +20,7 @@ from mme_vla.evaluation.records import EpisodeKey
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.probing import card as card_module
 from mme_vla.probing.arms import read_arm
 from mme_vla.probing.card import (
     ARMS,
@@ -161,16 +162,30 @@ def test_the_score_is_undefined_where_both_losses_lie_within_noise() -> None:
 
 
 def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
-    def moments(name: str, changes: list[float]) -> list[MomentLine]:
+    def moments(name: str, changes: list[float], spread: float = 0.1) -> list[MomentLine]:
         return [
-            MomentLine(name, "VideoUnmask", 16 * i, 0, "", "distract:1", 1.0, 4, [], change, 0.1, 0.0)
+            MomentLine(name, "VideoUnmask", 16 * i, 0, "", "distract:1", 1.0, 4, [], change, spread, 0.0)
             for i, change in enumerate(changes)
         ]
 
     lines = moments("a", [0.0, 0.5, 0.1, 0.0]) + moments("b", [0.1, 0.0, 0.0, 0.0]) + moments("c", [0.5, 0, 0, 0.5])
     assert recovery(lines) == Recovery(2.0, 2, 3, 4.0)
     assert recovery(moments("c", [0.0, 0.5])) == Recovery(None, 0, 1, 2.0)
+    assert recovery(moments("d", [0.5, 1e-4, 0.0], spread=0.0)) == Recovery(1.0, 1, 1, 3.0), "a policy without noise"
     assert recovery([]) is None
+
+
+def test_a_card_without_another_scene_to_show_has_no_recovery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plans: list[ProbePlan] = []
+    donors = recordings()
+    monkeypatch.setattr(card_module, "lacking", lambda arm, *_, **__: "a camera" if arm.name == "distract:1" else None)
+    monkeypatch.setattr(card_module, "run_probe", lambda policy, plan, *_, **__: plans.append(plan))
+    monkeypatch.setattr(card_module, "evaluate", lambda *_, **__: None)
+    monkeypatch.setattr(card_module, "_outcomes", lambda *_: scenes([1, 1]))
+    plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
+    card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), base=make_choice_env)
+    assert card.recovery is None and card.notes == ["wrong scene first (distract:1) was left out: it needs a camera."]
+    assert all("distract:1" not in plan.arms for plan in plans)
 
 
 @pytest.mark.slow

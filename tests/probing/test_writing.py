@@ -1,11 +1,13 @@
 """The score of writing: its definitions on synthetic episodes, and that it separates evidence from chance on tasks."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
 from mme_vla.cli.analyse import main
 from mme_vla.envs.episodes import choose_episodes
@@ -95,6 +97,16 @@ def test_memories_that_need_a_policy_or_keep_no_frames_are_refused() -> None:
         score_writing(Keyframes(32, 16), [synthetic()])
     with pytest.raises(UserError, match="keeps none"):
         score_writing(TTT(32, 16, max_steps=8, max_video=4), [synthetic()])
+
+
+@pytest.mark.parametrize("name", ["keyframes", "moment"])
+def test_memories_that_read_tokens_are_scored_by_their_policy(name: str) -> None:
+    policy = quick_policy(f"{name}_modul", 8).eval()
+    memory, base = policy.require_memory(), synthetic(length=120, exec_start=60)
+    images = {frame: np.full((64, 64, 3), 2 * frame, np.uint8) for frame in required_frames(memory) if frame < 120}
+    facts = {name: frames for name, frames in base.facts.items() if frames[-1] < 120}
+    row = score_writing(memory, [replace(base, facts=facts, images=images)], policy).to_dict()["mean"]
+    assert 0 < row["precision"] <= 1 and 0 < row["recall"] <= 1 and row["facts"] == 3
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def curves_of(
 
 def _point(turned: float, records: Sequence[EpisodeRecord], confidence: float) -> Point:
     won = sum(record.success for record in records)
-    low, high = wilson(won / len(records), len(records), confidence)
+    low, high = wilson(won / len(records), len({record.episode for record in records}), confidence)
     return Point(turned, won, len(records), Interval(100 * low, 100 * high))
 
 
@@ -106,19 +106,27 @@ def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> 
     figures = {}
     for task, dial in dict.fromkeys((task, dial) for _, task, dial in sorted(curves)):
         mine = {run: points for (run, its, of), points in curves.items() if (its, of) == (task, dial)}
-        with figure((5.6, 3.2)) as (canvas, (axes,)):
-            for i, (run, points) in enumerate(mine.items()):
+        labels = distinct_parts(list(mine))
+        with figure((5.6, 3.0 + 0.2 * len(mine))) as (canvas, (axes,)):
+            for i, points in enumerate(mine.values()):
                 rates = [p.rate for p in points]
                 below = [max(p.rate - p.interval.low, 0) for p in points]
                 above = [max(p.interval.high - p.rate, 0) for p in points]
                 axes.errorbar([p.turned for p in points], rates, [below, above], fmt="-o", ms=5, capsize=3,
-                              color=COLOURS[i % len(COLOURS)], label=run)  # fmt: skip
+                              color=COLOURS[i % len(COLOURS)], label=labels[i])  # fmt: skip
             axes.set_xlabel(f"{dial}: {unit}")
             axes.set_ylabel("success (%)")
             axes.set_ylim(0, 100)
-            axes.legend(fontsize=8)
+            canvas.legend(fontsize=8, loc="outside lower left")
             figures[f"{task}, {dial}"] = svg(canvas)
     return figures
+
+
+def distinct_parts(runs: Sequence[str]) -> list[str]:
+    """The names of runs without what all of them share, for a legend."""
+    parts = [run.split(", ") for run in runs]
+    shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set[str]()
+    return [", ".join(part for part in its if part not in shared) for its in parts]
 
 
 EXTRA = "process"  # Where a record keeps it

@@ -1,6 +1,13 @@
-"""Runs with events beside their matched arms, the same scenes and noise without: pairs, and success over length."""
+"""Runs with events beside their matched arms, the same scenes and noise without: pairs, and success over length.
 
+Trainings of one recipe on the same data are one row and one curve.
+"""
+
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
@@ -9,6 +16,7 @@ from mme_vla.evaluation.results.compare import show_p, sign_test
 from mme_vla.evaluation.results.curves import Curves, Place, curves_of
 from mme_vla.evaluation.results.tables import Table
 from mme_vla.evaluation.rollout.events import split_words
+from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.registry import EVENTS
 
 Pair = tuple[EpisodeRecord, EpisodeRecord]
@@ -46,33 +54,60 @@ def did_not_act(record: EpisodeRecord) -> list[str]:
     return [entry["event"] for entry in record.extra.get("events", ()) if entry["step"] is None]
 
 
+def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
+    """A line for each event that did not act in some episodes."""
+    counts = Counter(event for record in records if record.outcome != "error" for event in did_not_act(record))
+    return [f"event={event} did not act in {count} episodes: its place never came." for event, count in counts.items()]
+
+
 def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
-    """Of every run with events and task: both success rates, and which outcomes the event changed."""
+    """Of every recipe, event and task: both success rates, and which outcomes the event changed.
+
+    A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all trainings.
+    """
     merged = merge(records, conflicts)
     require(any(record.event for record in merged), NO_EVENTS)
-    rows, rules = [], set()
+    groups: dict[RunKey, list[Pair]] = {}
     for run, pairs in matched_pairs(merged).items():
+        groups.setdefault(run._replace(training=_recipe(run.training)), []).extend(pairs)
+    rows, rules = [], set()
+    for run, pairs in groups.items():
         tasks = list(dict.fromkeys(record.task for record, _ in pairs))
         for task in [*tasks, *(["all"] if len(tasks) > 1 else [])]:
             there = [pair for pair in pairs if task in ("all", pair[0].task)]
             rows.append([str(run._replace(event=None)), str(run.event), task, *_counts(there)])
         rules.add(len(rows))
-    columns = ["run", "event", "task", "pairs", "without (%)", "with (%)", "kept", "lost", "gained", "p", "did not act"]
+    columns = [
+        "run", "event", "task", "trainings", "pairs", "without (%)", "with (%)", "kept", "lost", "gained", "p",
+        "did not act",
+    ]  # fmt: skip
     return Table("Events beside their matched arms", columns, rows, rules - {len(rows)})
 
 
+def _recipe(training: TrainingIdentity | None) -> TrainingIdentity | None:
+    """What trainings with other seeds share."""
+    return None if training is None else replace(training, seed=None, weights=None)
+
+
 def _counts(pairs: Sequence[Pair]) -> list[str]:
-    retained = sum(record.success and baseline.success for record, baseline in pairs)
-    lost = sum(baseline.success and not record.success for record, baseline in pairs)
-    gained = sum(record.success and not baseline.success for record, baseline in pairs)
-    rates = [f"{100 * count / len(pairs):.1f}" for count in (retained + lost, retained + gained)]
+    trainings: dict[TrainingIdentity | None, list[tuple[bool, bool]]] = {}
+    for record, baseline in pairs:
+        trainings.setdefault(record.training, []).append((baseline.success, record.success))
+    outcomes = [outcome for part in trainings.values() for outcome in part]
+    retained, lost, gained = (outcomes.count(outcome) for outcome in ((True, True), (True, False), (False, True)))
+    rates = 100 * np.array([np.mean(part, axis=0) for part in trainings.values()])
+    texts = [f"{rate:.1f}" for rate in rates.mean(0)]
+    if len(rates) > 1:
+        texts = [f"{text} ± {std:.1f}" for text, std in zip(texts, rates.std(0, ddof=1), strict=True)]
     idle = sum(bool(did_not_act(record)) for record, _ in pairs)
-    return [str(len(pairs)), *rates, str(retained), str(lost), str(gained), show_p(sign_test(lost, gained)), str(idle)]
+    counts = [str(len(trainings)), str(len(pairs)), *texts, str(retained), str(lost), str(gained)]
+    return [*counts, show_p(sign_test(lost, gained)), str(idle)]
 
 
 def event_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
     """Success over the number of every event that has one; the plain run is at its neutral number."""
-    return curves_of(merge(records, conflicts), _place, confidence)
+    merged = [replace(record, training=_recipe(record.training)) for record in merge(records, conflicts)]
+    return curves_of(merged, _place, confidence)
 
 
 def _place(record: EpisodeRecord) -> Place | None:

@@ -157,11 +157,12 @@ def read_event(text: str) -> PlacedEvent:
     key, words = f"event={text}", split_words(text)
     if words is None:
         raise UserError(f"{key}: {FORM}.")
+    check_choice(f"{key}: name", words.name, EVENTS)
     kind: Any = EVENTS[words.name]
     require(words.value is None or kind.dial is not None, f"{key}: {words.name} takes no number.")
     require(words.unit is None or kind.placed, f"{key}: {words.name} takes no place; leave out @{words.unit}:….")
     options = {} if words.value is None else {kind.dial: words.value}
-    event: Event = read_section(kind, options, f"event.{words.name}")
+    event: Event = read_section(kind, options, f"{key}: {words.name}")
     unit, number = words.unit or "step", words.number or 0
     check_choice(f"{key}: place", unit, ("step", "subtask"))
     least = 0 if unit == "step" else 1

@@ -4,7 +4,7 @@ After EventVLA, whose head predicts keyframes from the hidden state of an action
 enough beside a few anchors, and suppresses neighbours. A memory here stands before the language model, so that the head
 reads what a frame looks like and how it differs from the stored frame before it. What it learns from are the sub-tasks
 of the dataset: a stored frame is a keyframe where a sub-task has begun since the stored frame before it. Without
-labels, as in nano, the action loss alone teaches it, through a straight-through sigmoid as in `learned_topk`.
+labels the action loss alone teaches it, through a straight-through sigmoid as in `learned_topk`.
 """
 
 from collections.abc import Sequence
