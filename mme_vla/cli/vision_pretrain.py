@@ -46,23 +46,34 @@ def _record(config: Mapping[str, Any], size: int) -> tuple[list[Path], list[Path
     """Render what is missing; the files of the scenes to learn from, and of those held out: the last of each task."""
     from mme_vla.data.console import progress
     from mme_vla.envs.episodes import choose_tasks
+    from mme_vla.envs.recording.processes import carry_out
+
+    folder, first, tasks = Path(config["output"]) / "scenes", config["first_seed"], choose_tasks(config["tasks"])
+    learned: list[Path] = []
+    held_out: list[Path] = []
+    jobs = []
+    for number in range(config["scenes"]):
+        measures = number >= config["scenes"] - config["held_out"]
+        arrangements = 0 if measures else config["arrangements"]
+        jobs += [(folder, task, first + number, LEVELS[number % len(LEVELS)], arrangements, size) for task in tasks]
+    with progress("scenes", len(jobs)) as advance:
+        for seed, file, error in carry_out(jobs, _recorded, config["workers"]):
+            if file is None:
+                logger.info("left out: %s", error)
+            else:
+                (learned if seed < first + config["scenes"] - config["held_out"] else held_out).append(file)
+            advance(1)
+    if not learned:
+        raise UserError(f"None of the {len(jobs)} scenes can be built: change first_seed={first}.")
+    return learned, held_out
+
+
+def _recorded(job: tuple[Path, str, int, str, int, int]) -> tuple[int, Path | None, str]:
+    """The scene's seed, its file, and why there is none: the benchmark's own rule tries a layout so many times."""
     from mme_vla.envs.scene.placement import SceneError
     from mme_vla.nano.scenes import record_scene
 
-    folder, first, tasks = Path(config["output"]) / "scenes", config["first_seed"], choose_tasks(config["tasks"])
-    scenes = [(task, number) for number in range(config["scenes"]) for task in tasks]
-    learned: list[Path] = []
-    held_out: list[Path] = []
-    with progress("scenes", len(scenes)) as advance:
-        for task, number in scenes:
-            scene = task, first + number, LEVELS[number % len(LEVELS)]
-            measures = number >= config["scenes"] - config["held_out"]
-            try:
-                file = record_scene(folder, *scene, 0 if measures else config["arrangements"], size)
-                (held_out if measures else learned).append(file)
-            except SceneError as error:  # of the benchmark's own rule, which tries so many times
-                logger.info("left out: %s", error)
-            advance(1)
-    if not learned:
-        raise UserError(f"None of the {len(scenes)} scenes can be built: change first_seed={first}.")
-    return learned, held_out
+    try:
+        return job[2], record_scene(*job), ""
+    except SceneError as error:
+        return job[2], None, str(error)

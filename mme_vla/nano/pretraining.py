@@ -31,7 +31,7 @@ POSITIVE = 2.0  # weight of a cell that shows an object, before those of classes
 SHIFT = 6  # pixels that an image is moved by at most
 PLACE_WEIGHT = 2.0  # of the error of places, in cells, beside that of presences
 BATCH = 64  # images that are evaluated together
-VOTES = 1.0  # presences that make an object, which has four cells
+VOTES = 0.5  # presences that make an object, which has four cells
 APART = 0.75  # cells: nearer reports of a class are one
 MATCH_DISTANCE = 3.0  # centimetres between an object and its report at most
 
@@ -43,7 +43,7 @@ class PretrainSettings:
     save_every: updates between two drafts. seed: of everything random.
     """
 
-    steps: int = 450
+    steps: int = 1300
     batch_size: int = 32
     lr: float = 2e-3
     save_every: int = 100
@@ -203,7 +203,7 @@ def pretrain(
                 logger.info("update %d of %d, loss %.3f", done, settings.steps, loss.item())
             advance(1)
     if held_out:
-        logger.info("Held-out scenes:\n%s", report(evaluate_tower(tower, Scenes.load(held_out))))
+        logger.info("Held-out scenes:\n%s", report(evaluate_tower(tower, Scenes.load(sorted(held_out)))))
     state = {name: value.contiguous().half() for name, value in tower.state_dict().items()}
     with write_atomically(weights_file) as path:
         save_file(state, path)
