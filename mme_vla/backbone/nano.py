@@ -70,8 +70,10 @@ class NanoConfig:
 
 
 MAX_VIEWS, MAX_WORDS = 4, 256
-GOAL_QUERIES = 4
-SHARPNESS = 4.0  # of fresh queries: each begins with a few words of a goal, where equal weights would dilute its colour
+GOAL_QUERIES = 6
+PREFERENCE = 1.0  # standard deviation of a fresh query's preferences: each begins with a few classes
+VOTE = 16.0  # of a word's number for a class: votes are learned sooner than what uses them
+WORDS_APART = 16.0  # a word so many places later counts e times less for a query with decay 1
 FIRST = CLASSES.index("red cube") - 1
 """Index, among the classes of a token, of the class that the goal names."""
 STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
@@ -131,28 +133,31 @@ class Reader(nn.Module):
 
 
 class GoalReader(nn.Module):
-    """Reads the goal as text: learned queries attend to its words, and what each reads selects classes of objects.
+    """Reads the goal as text: each of its words votes for classes of objects, and q queries select by the votes.
 
     Features of the selected classes always have the same place in a token. So what is learned of the object that a goal
-    names holds for objects of every class.
+    names holds for objects of every class. Votes are a number for each word and class, which all tasks share. A query
+    prefers some classes to others, and half of the queries count earlier words more.
     """
 
     def __init__(self, config: NanoConfig) -> None:
         super().__init__()
-        width = config.vlm.width
-        self.queries = nn.Linear(width, GOAL_QUERIES, bias=False)
-        self.classes = nn.Linear(width, len(OBJECT_CLASSES))
-        self.condition = nn.Linear(GOAL_QUERIES * width, config.action.width)
+        kinds = len(OBJECT_CLASSES)
+        self.votes = nn.Embedding(config.vocab_size, kinds)
+        self.preference = nn.Parameter(PREFERENCE * torch.randn(GOAL_QUERIES, kinds))
+        self.decay = nn.Parameter(torch.arange(GOAL_QUERIES) % 2 / 1)
+        self.condition = nn.Linear(GOAL_QUERIES * kinds, config.action.width)
 
-    def forward(self, words: Tensor, mask: Tensor) -> Tensor:
-        """What the queries read [b, q, d] of words [b, l, d]."""
-        scores = self.queries(words).masked_fill(~mask[..., None], torch.finfo(words.dtype).min)
-        return torch.einsum("blq,bld->bqd", scores.softmax(1), words)
+    def reset(self) -> None:
+        """Let every word begin without a vote."""
+        nn.init.zeros_(self.votes.weight)
 
-    def select(self, words: Tensor, mask: Tensor) -> Tensor:
-        """The share of each class in what a query selects [b, q, K]; those of a query add up to 1."""
-        selected: Tensor = self.classes(self(words, mask)).softmax(-1)
-        return selected
+    def forward(self, prompt: Tensor, mask: Tensor) -> Tensor:
+        """The share of each class in what a query selects [b, q, K], of a prompt [b, l]; a query's add up to 1."""
+        places = torch.arange(prompt.shape[1], device=prompt.device) / WORDS_APART
+        weights = (-self.decay[:, None] * places).exp()
+        votes = VOTE * self.votes(prompt) * mask[..., None]
+        return (torch.einsum("ql,blk->bqk", weights, votes) + self.preference).softmax(-1)
 
 
 class Column(nn.Module):
@@ -241,8 +246,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             if name != "vision":
                 initialise(module)
         if self.goal_reader is not None:
-            with torch.no_grad():
-                self.goal_reader.queries.weight.mul_(SHARPNESS)
+            self.goal_reader.reset()
         # The pointer has its own fresh weights.
         self.pointer = Pointer(action_width, width, GOAL_QUERIES) if config.point == "objects" else None
         self.make_head(config)
@@ -280,8 +284,8 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         says which word names which.
         """
         if self.goal_reader is not None:
-            selected = self.goal_reader.select(self._words(prompt), prompt_mask).to(tokens.dtype)
-            features = torch.einsum("bqk,b...kf->b...qf", selected, by_class(tokens[..., : -self.spare]))
+            selected = self.goal_reader(prompt, prompt_mask).to(tokens.dtype)
+            features = torch.einsum("bqk,b...kf->b...qf", selected, by_class(tokens))
             return torch.cat([tokens[..., : -self.spare], features.flatten(-2)], -1)
         assert isinstance(self.vision, ConvTower)  # as `NanoConfig` says
         named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
@@ -363,14 +367,13 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         (prompt,) = (block for block in injection.blocks if block.name == "prompt")
         words = self.prompt_in(prompt.tokens) * batch.prompt_mask[..., None]
         condition = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
+        pointing = None
         if self.goal_reader is not None:
-            condition = condition + self.goal_reader.condition(self.goal_reader(prompt.tokens, prompt.mask).flatten(1))
+            selected = self.goal_reader(batch.prompt, batch.prompt_mask)
+            condition = condition + self.goal_reader.condition(selected.flatten(1))
+            pointing = self._view_tokens(batch, 1)[:, 0], selected
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
-        pointing = None
-        if self.pointer is not None:
-            assert self.goal_reader is not None  # `NanoConfig` says so
-            pointing = self._view_tokens(batch, 1)[:, 0], self.goal_reader.select(prompt.tokens, prompt.mask)
         return Context(keys_values, mask, condition, injection.hook, pointing)
 
     def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:

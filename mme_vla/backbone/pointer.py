@@ -5,15 +5,17 @@ import math
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.tower import CLASSES, WAVES, located, place_waves
+from mme_vla.backbone.tower import WAVES, located, place_waves
 
 ABSENT = 1e-4  # presence that is added to every one
+UNLIKELY = 1e-3  # share that every class has in what is selected
 
 
 class Pointer(nn.Module):
-    """Weighs objects that tokens of `PlaceTower` show, by their class and their place, with an action token's query.
+    """Weighs objects that tokens of `PlaceTower` show, with an action token's query.
 
-    Every class of every token is a component of the mixture. What to point at is learned once for all places, where
+    Every class of every token is a component of the mixture. An action token weighs the queries of the goal, whose
+    classes are then likely, and places. So what to point at is learned once for all classes and places, where
     regression learns it for each place anew, and the most probable object is taken where regression takes the middle of
     several.
 
@@ -24,8 +26,7 @@ class Pointer(nn.Module):
     def __init__(self, action_width: int, width: int, goals: int) -> None:
         super().__init__()
         self.query = nn.Linear(action_width, width)
-        self.classes = nn.Embedding(len(CLASSES), width)
-        self.selected = nn.Linear(goals, width, bias=False)
+        self.goals = nn.Linear(action_width, goals)
         self.near = nn.Linear(WAVES**2, width, bias=False)
         self.visible = nn.Parameter(torch.ones(()))
         self.point = nn.Linear(2, 2)
@@ -41,9 +42,10 @@ class Pointer(nn.Module):
                 selects, [b, q, K].
         """
         presence, where = located(tokens.to(self.near.weight.dtype))
-        classes = self.classes.weight + self.selected(selected.transpose(1, 2))  # b k w
-        keys = (classes[:, None] + self.near(place_waves(where))).flatten(1, 2)
+        keys = self.near(place_waves(where)).flatten(1, 2)
         logits = self.query(actions) @ keys.transpose(1, 2) / math.sqrt(keys.shape[-1])
+        classes = (self.goals(actions).softmax(-1) @ selected + UNLIKELY).log()  # b h K
+        logits = logits + classes.repeat(1, 1, tokens.shape[1])
         logits = logits + (self.visible * (presence + ABSENT).log()).flatten(1)[:, None]
         points = self.point(where).flatten(1)[:, None]
         return torch.cat([logits, points.expand(-1, actions.shape[1], -1)], -1)

@@ -37,6 +37,7 @@ COLUMNS, ROWS = (-0.7, 0.7), (-1.0, 0.1)
 """The part of an image, whose sides are −1 … 1, in which tasks take place; places are −1 … 1 in it."""
 WAVES = 4
 """Orders of the cosines, along each axis, that say how the objects of a class are distributed."""
+TOKEN_WIDTH = (4 + WAVES**2) * len(CLASSES)
 FACTORS = (1.0, 16.0, 16.0, 16.0, 16.0)
 """Of presence, share, column, row and waves: between the size of a token's numbers and of a mean of 64 tokens."""
 
@@ -133,7 +134,7 @@ class PlaceTower(nn.Module):
     @property
     def token_width(self) -> int:
         """D."""
-        return (4 + WAVES**2) * len(CLASSES)
+        return TOKEN_WIDTH
 
     def locate(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Presence logits [n, K, s/4, s/4], and places [n, K, 2, s/4, s/4]: column and row from a cell's centre.
@@ -195,9 +196,45 @@ def located(tokens: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def by_class(tokens: Tensor) -> Tensor:
-    """The features of each class [..., K, 20] in tokens [..., 20·K] of `PlaceTower`."""
+    """The features of each class [..., K, 20] in tokens [..., ≥ 20·K] of `PlaceTower`."""
     first = tokens[..., : 4 * len(CLASSES)].unflatten(-1, (4, len(CLASSES))).transpose(-2, -1)
-    return torch.cat([first, tokens[..., 4 * len(CLASSES) :].unflatten(-1, (len(CLASSES), -1))], -1)
+    return torch.cat([first, tokens[..., 4 * len(CLASSES) : TOKEN_WIDTH].unflatten(-1, (len(CLASSES), -1))], -1)
+
+
+def reflect(tokens: Tensor, signs: Tensor, exchange: Tensor) -> Tensor:
+    """Tokens [b, …, ≥ 20·K] of `PlaceTower` as if all objects lay at reflected places.
+
+    Tokens of an image keep their order, so that only their numbers say where an object is. The numbers of selected
+    classes behind those of the tower are left as they are.
+
+    Args:
+        signs: of columns and rows, 1 or −1, [b, 2]. exchange: whether column and row then change places, [b] bool.
+    """
+    count, ones = 4 * len(CLASSES), [1] * (tokens.ndim - 2)
+    presence, share, column, row = tokens[..., :count].chunk(4, -1)
+    across, along = (sign.view(-1, *ones, 1) for sign in signs.unbind(-1))
+    swapped = exchange.view(-1, *ones, 1)
+    column, row = torch.where(swapped, row * along, column * across), torch.where(swapped, column * across, row * along)
+    # A cosine of odd order changes its sign where its place does.
+    odd = torch.arange(WAVES, device=tokens.device) % 2 == 1
+    signed = torch.where(odd, signs[..., None], 1).to(tokens.dtype)  # b 2 i
+    factors = (signed[:, 0, :, None] * signed[:, 1, None]).view(-1, *ones, 1, WAVES, WAVES)
+    waves = tokens[..., count:TOKEN_WIDTH].unflatten(-1, (-1, WAVES, WAVES)) * factors
+    waves = torch.where(swapped[..., None, None], waves.transpose(-2, -1), waves).flatten(-3)
+    return torch.cat([presence, share, column, row, waves, tokens[..., TOKEN_WIDTH:]], -1)
+
+
+def reflect_points(points: Tensor, signs: Tensor, exchange: Tensor) -> Tensor:
+    """Rows and columns [b, …, 2] as shares of an image's sides, at the places where `reflect` puts objects."""
+    ones = [1] * (points.ndim - 2)
+    row, column = points.unbind(-1)
+    column, row = within(column, COLUMNS) * signs[:, 0].view(-1, *ones), within(row, ROWS) * signs[:, 1].view(-1, *ones)
+    swapped = exchange.view(-1, *ones)
+    column, row = torch.where(swapped, row, column), torch.where(swapped, column, row)
+    sides = [
+        (place * (high - low) / 2 + (low + high) / 2 + 1) / 2 for place, (low, high) in ((row, ROWS), (column, COLUMNS))
+    ]
+    return torch.stack(sides, -1)
 
 
 def place_waves(where: Tensor) -> Tensor:

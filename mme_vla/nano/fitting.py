@@ -220,7 +220,8 @@ def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
 
     samples = Decisions.of(
         policy, read(learnt), learning["elsewhere"], build_transforms(learning.get("history_transforms")),
-        int(job.config["seed"]), oversample=learning["often"], noise=learning["noise"], token_noise=learning["blur"],
+        int(job.config["seed"]), learning["reflect"], learning["sides"],
+        oversample=learning["often"], noise=learning["noise"], token_noise=learning["blur"],
     )  # fmt: skip
     return samples, Decisions.of(policy, read(measured), learning["elsewhere"])
 

@@ -1,6 +1,7 @@
 """Training on demonstrations of motions or choices: every decision is a sample, of tokens made beforehand."""
 
 import logging
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,7 +12,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from mme_vla.backbone.nano import NanoBackbone
 from mme_vla.backbone.siglip import pool_grid
+from mme_vla.backbone.tower import reflect, reflect_points
 from mme_vla.data.columns import BOUNDARY, SUBTASK, with_labels
 from mme_vla.embodiment.action_space import MIDDLE
 from mme_vla.errors import require
@@ -93,6 +96,59 @@ class Replay:
         return stack_history(items)
 
 
+@dataclass(frozen=True)
+class Reflection:
+    """Mirrors the places of a decision's objects, in its images, its memory and its point alike.
+
+    What is learned of one place then holds for others. The robot's joints stay as they are.
+
+    p: probability of each of three changes: columns are mirrored, rows are, and both change places. bounds: what the
+    numbers of points [2] are normalised by. columns: of a point in an action. fixed: [n] bool, decisions that it leaves
+    alone.
+    """
+
+    p: float
+    bounds: tuple[Tensor, Tensor]
+    columns: Sequence[int]
+    fixed: Tensor
+
+    @classmethod
+    def of(cls, policy: MMEPolicy, p: float, goals: Sequence[str], sides: Sequence[str]) -> "Reflection | None":
+        """None with p=0. goals: of all decisions. sides: words of goals that depend on where left or forward is."""
+        if not p:
+            return None
+        require(0 < p < 1, f"learning.reflect={p} must be a probability below 1.")
+        space, stats = policy.embodiment.action, policy.require_processor().stats
+        places = isinstance(policy.backbone, NanoBackbone) and policy.backbone.config.vision.layout == "places"
+        require(
+            len(space.point) == 2 and places and stats is not None,
+            f"learning.reflect={p} needs a point in the image and located objects: set learning.reflect=0, or "
+            "embodiment=robomme_choice_front and backbone=nano_choice.",
+        )
+        assert stats is not None
+        columns = list(space.point)
+        low, high = (torch.as_tensor(end, dtype=torch.float32)[columns] for end in stats.actions.bounds("quantiles"))
+        fixed = [any(re.search(rf"\b{side}\b", goal) for side in sides) for goal in goals]
+        return cls(p, (low, high), columns, torch.tensor(fixed))
+
+    def __call__(self, batch: Batch, rows: Sequence[int]) -> Batch:
+        """The batch of these decisions with its objects elsewhere, as chosen by the rows."""
+        generator = torch.Generator().manual_seed(hash((1, *rows)))
+        changes = (torch.rand(3, len(rows), generator=generator) < self.p) & ~self.fixed[torch.as_tensor(list(rows))]
+        signs, exchange = torch.where(changes[:2], -1.0, 1.0).T, changes[2]
+        assert batch.view_tokens is not None and batch.actions is not None
+        low, high = self.bounds
+        actions, half = batch.actions.clone(), (high - low) / 2
+        points = actions[..., self.columns]
+        reflected = (reflect_points((points + 1) * half + low, signs, exchange) - low) / half - 1
+        moved = changes.any(0).view(-1, *[1] * (points.ndim - 1))  # the others stay equal to the last bit
+        actions[..., self.columns] = torch.where(moved, reflected, points).to(actions.dtype)
+        history = batch.history
+        if history is not None:
+            history = replace(history, features=reflect(history.features, signs, exchange))
+        return replace(batch, view_tokens=reflect(batch.view_tokens, signs, exchange), actions=actions, history=history)
+
+
 class Decisions(Dataset[int]):
     """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
 
@@ -105,6 +161,7 @@ class Decisions(Dataset[int]):
         to each number of a remembered token, `VIEW_NOISE` of it to those of current images, and `JOINT_NOISE` of it to
         each joint (radians).
     token_noise: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
+    reflection: puts the objects of all frames of a decision elsewhere whenever it is learned.
     replay: selects the history of a decision anew in each epoch, where transforms change the demonstrations' frames.
     """
 
@@ -118,9 +175,10 @@ class Decisions(Dataset[int]):
         oversample: int = 1,
         noise: float = 0.0,
         token_noise: float = 0.0,
+        reflection: "Reflection | None" = None,
         replay: Replay | None = None,
     ) -> None:
-        self.replay, self.tasks = replay, tasks
+        self.replay, self.tasks, self.reflection = replay, tasks, reflection
         self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, oversample, 1))
 
@@ -132,24 +190,28 @@ class Decisions(Dataset[int]):
         min_distance: float = MIN_DISTANCE,
         transforms: Sequence[HistoryTransform] = (),
         seed: int = 0,
+        reflect_p: float = 0.0,
+        sides: Sequence[str] = (),
         **options: Any,
     ) -> "Decisions":
         """Select what a policy reads at each decision.
 
         policy: with statistics. demonstrations: with the tokens of their frames; alone they are encoded now.
         min_distance: metres from which on a motion leads to another place. transforms: of a demonstration's frames,
-        chosen by `seed` and epoch. options: see the class.
+        chosen by `seed` and epoch. reflect_p, sides: see `Reflection`. options: see the class.
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
         rows: list[tuple[History, int, FrameLabels]] = []
         tasks: list[str] = []
+        goals: list[str] = []
         for entry in demonstrations:
             demonstration, made = (entry, tokenize(policy, entry)) if isinstance(entry, Demonstration) else entry
             history = _history(policy, demonstration, made)
             new = _items(policy, demonstration, history, made)
             items += new
             tasks += [demonstration.task] * len(new)
+            goals += [demonstration.goal] * len(new)
             if history is not None and transforms:
                 labels = _labels(policy.require_memory(), demonstration)
                 rows += [(history, frame, labels) for frame in _decisions(policy, demonstration)]
@@ -160,7 +222,9 @@ class Decisions(Dataset[int]):
             items = [item | {"history": replace(item["history"], labels=Labels())} for item in items]
             rows = [(history, frame, {}) for history, frame, _ in rows]
         replay = Replay(policy.require_memory(), rows, transforms, seed) if rows else None
-        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), tasks, replay=replay, **options)
+        reflection = Reflection.of(policy, reflect_p, goals, sides)
+        stacked = torch.from_numpy(np.concatenate(distant))
+        return cls(_stack(items), stacked, tasks, reflection=reflection, replay=replay, **options)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -178,6 +242,8 @@ class Decisions(Dataset[int]):
         batch = self.batch.rows(indices)
         if self.replay is not None:
             batch = replace(batch, history=self.replay.select(rows, self.epoch))
+        if self.reflection is not None:
+            batch = self.reflection(batch, rows)
         return self._noisy(batch, rows) if self.noise or self.token_noise else batch
 
     def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:

@@ -7,7 +7,7 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.choice import SPREAD, WEIGHT, ChoiceHead
 from mme_vla.backbone.pointer import Pointer
-from mme_vla.backbone.tower import CLASSES, COLUMNS, ROWS, located, summarise, within
+from mme_vla.backbone.tower import CLASSES, COLUMNS, ROWS, located, reflect, reflect_points, summarise, within
 from mme_vla.nano.pretraining import label_cells
 
 RED, BLUE = CLASSES.index("red cube"), CLASSES.index("blue cube")
@@ -28,9 +28,42 @@ def test_tokens_say_where_an_object_is() -> None:
     assert torch.allclose(where[0, token, RED], expected, atol=0.01)
 
 
+@pytest.mark.parametrize("exchange", [False, True])
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+def test_reflected_tokens_are_those_of_objects_at_reflected_points(signs: tuple[float, float], exchange: bool) -> None:
+    objects = [(RED, 0.43, 0.31), (BLUE, 0.6, 0.2), (RED, 0.35, 0.15)]
+    how = torch.tensor([signs]), torch.tensor([exchange])
+    points = reflect_points(torch.tensor([[[row, column] for _, column, row in objects]]), *how)[0].tolist()
+    expected = image_of(*((kind, column, row) for (kind, _, _), (row, column) in zip(objects, points, strict=True)))
+    reflected = reflect(image_of(*objects), *how)
+    sums = slice(len(CLASSES), None)  # presence is the largest of a token's cells, and tokens keep their order
+    assert torch.allclose(reflected.sum(1)[:, sums], expected.sum(1)[:, sums], atol=1e-4)
+    if signs == (1.0, 1.0) and not exchange:
+        assert torch.equal(reflected, image_of(*objects))
+
+
+def test_a_pointer_points_at_classes_of_the_query_that_it_weighs() -> None:
+    pointer, action = Pointer(8, 32, 2), torch.ones(1, 1, 8)
+    selected = torch.zeros(1, 2, len(CLASSES))
+    selected[0, 0, RED] = selected[0, 1, BLUE] = 1
+    tokens = image_of((RED, 0.43, 0.31), (BLUE, 0.6, 0.2))
+    with torch.no_grad():
+        pointer.query.weight.zero_()
+        pointer.query.bias.zero_()
+        for query, kind in ((0, RED), (1, BLUE)):
+            pointer.goals.weight.zero_()
+            pointer.goals.bias.copy_(torch.tensor([10.0, -10.0] if query == 0 else [-10.0, 10.0]))
+            logits = pointer(action, tokens, selected)[0, 0, : 64 * len(CLASSES)]
+            assert logits.argmax() % len(CLASSES) == kind
+
+
 def test_a_pointer_that_learned_a_class_at_some_places_finds_it_at_others() -> None:
     torch.manual_seed(0)
-    pointer, asked, selected = Pointer(8, 32, 2), torch.ones(1, 1, 8), torch.zeros(1, 2, len(CLASSES))
+    pointer, asked, selected = (
+        Pointer(8, 32, 2),
+        torch.ones(1, 1, 8),
+        torch.full((1, 2, len(CLASSES)), 1 / len(CLASSES)),
+    )
     head = ChoiceHead(horizon=1, action_dim=3, choice=[0])
     optimizer = torch.optim.Adam(pointer.parameters(), 1e-2)
     places = torch.rand(8, 4).tolist()

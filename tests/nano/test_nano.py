@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.nano_policies import demonstration, nano
-from mme_vla import UserError
+from helpers.nano_policies import EVERY_EIGHTH, demonstration, nano
+from mme_vla import UserError, build_policy
 from mme_vla.backbone.tower import CLASSES, by_class, summarise
 from mme_vla.cli import nano as nano_command
 from mme_vla.cli.nano import with_settings
+from mme_vla.data.waypoints import Motions
 from mme_vla.memory.transforms import RepeatFrame
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
@@ -149,16 +150,53 @@ def test_the_goal_selects_classes_by_its_words_and_not_by_what_is_behind_them() 
     backbone, processor = policy.backbone, policy.require_processor()
     goals = ["pick up the red cube", "pick up the green cube"]
     ids, masks = (torch.stack(part) for part in zip(*map(processor.prompt, goals), strict=True))
-    tokens = torch.rand(2, 3, backbone.vision_width)
+    tokens, reader = torch.rand(2, 3, backbone.vision_width), backbone.goal_reader
     with torch.no_grad():
+        reader.votes.weight.copy_(torch.randn_like(reader.votes.weight))
         read = backbone.condition_on_prompt(tokens, ids, masks)
         padded = backbone.condition_on_prompt(tokens, torch.where(masks, ids, 7), masks)
-        selected = backbone.goal_reader.select(backbone._words(ids), masks)
+        selected = reader(ids, masks)
     seen = backbone.vision.token_width
     assert torch.equal(read, padded) and torch.equal(read[..., :seen], tokens[..., :seen])
-    expected = torch.einsum("bqk,bnkf->bnqf", selected, by_class(tokens[..., :seen])).flatten(-2)
+    expected = torch.einsum("bqk,bnkf->bnqf", selected, by_class(tokens)).flatten(-2)
     assert torch.allclose(read[..., seen:], expected) and torch.allclose(selected.sum(-1), torch.tensor(1.0))
     assert not torch.allclose(selected[0], selected[1])
+
+
+def test_half_of_the_queries_tell_which_class_is_named_first() -> None:
+    backbone, processor = nano("pi05").backbone, nano("pi05").require_processor()
+    reader = backbone.goal_reader
+    (red, _), (green, _) = (processor.prompt(f"the {colour} cube") for colour in ("red", "green"))
+    word = int((red != green).nonzero()[0, 0])
+    with torch.no_grad():
+        reader.preference.zero_()
+        reader.votes.weight[red[word], 1], reader.votes.weight[green[word], 2] = 1.0, 1.0
+        selected = reader(*(part[None] for part in processor.prompt("the red cube and the green cube")))[0]
+    assert torch.allclose(selected[::2, 1], selected[::2, 2])
+    assert (selected[1::2, 1] > 2 * selected[1::2, 2]).all()
+
+
+def test_only_decisions_whose_goal_names_no_side_are_reflected() -> None:
+    words = {"backbone": "nano_choice", "embodiment": "robomme_choice_front", "policy": {"augment": False}}
+    policy = build_policy("framesamp_modul", memory=EVERY_EIGHTH, **words)
+    made = demonstration()
+    choices = np.zeros((3, 10), np.float32)
+    choices[:, 0], choices[:, 8:] = 1, [[0.3, 0.4], [0.2, 0.6], [0.35, 0.5]]
+    made = replace(made, motions=Motions(made.motions.decisions, choices))
+    policy.require_processor().stats = statistics([made], policy)
+    left = replace(made, goal=f"{made.goal} on the left")
+    samples = Decisions.of(policy, [made, left], reflect_p=0.99, sides=["left"])
+    rows = range(len(samples.batch.prompt))
+    batch, half = samples.collate(list(rows)), len(rows) // 2
+    assert not torch.equal(batch.actions[:half], samples.batch.actions[:half])
+    assert not torch.equal(batch.history.features[:half], samples.batch.history.features[:half])
+    assert torch.equal(batch.view_tokens[half:], samples.batch.view_tokens[half:])
+    assert torch.equal(batch.actions[half:], samples.batch.actions[half:])
+    assert torch.equal(batch.state, samples.batch.state)
+    motions = nano("pi05")
+    motions.require_processor().stats = statistics([demonstration()], motions)
+    with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
+        Decisions.of(motions, [demonstration()], reflect_p=0.5, sides=[])
 
 
 def test_features_of_a_class_are_those_that_the_tower_gives_it() -> None:
