@@ -29,7 +29,7 @@ def main(rounds: int = 8, group: int = 6, epochs: int = 4) -> tuple[float, float
     """Success rates before and after."""
     policy = build_policy("pi05", backbone="nano_choice", embodiment="robomme_choice_front", seed=0)
     policy.require_processor().stats = NormStats.unit(8, 10)
-    optimizer = torch.optim.AdamW(tower_free(policy), 3e-4)
+    optimizer = torch.optim.AdamW(tower_free(policy), 1e-3)
     rates = []
     for step in range(rounds):
         seeds = range(step * group, (step + 1) * group)

@@ -28,7 +28,7 @@ class TwoChoices:
 
     def _frame(self) -> dict[str, list[Any]]:
         image = np.zeros((256, 256, 3), np.uint8)
-        image[64:192, 64:192, "ab".index(self.right)] = 220
+        image[90:108, 120:138, "ab".index(self.right)] = 220  # as large as a cube, which the vision tower locates
         state = {"joint_state_list": [np.zeros(7, np.float32)], "gripper_state_list": [np.zeros(2, np.float32)]}
         return {"front_rgb_list": [image], **state}
 

@@ -156,7 +156,7 @@ class RMT(RecurrentMemory):
         Args:
             hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64.
             heads, kv_heads: query and key heads of the slots' attention; None is a head for each 64 of `hidden`, at
-                least 2.
+                least 2, or fewer where these do not divide it into even widths.
             rotation: `full`, or `cosine_only`: what the released evaluation ran, because its loading dropped the
                 imaginary part of the rotary table.
             attention_dtype: what queries, keys and values are cast to; `bfloat16` as released; `float32` takes
@@ -164,6 +164,6 @@ class RMT(RecurrentMemory):
         """
         check_sizes("memory", budget=budget)
         hidden = default_hidden(d_vision, hidden)
-        heads = heads or max(2, hidden // 64)
+        heads = heads or next(n for n in range(max(2, hidden // 64), 0, -1) if hidden % (2 * n) == 0 or n == 1)
         layer = RMTLayer(hidden, heads, kv_heads, budget, rotation, attention_dtype)
         super().__init__(d_vision, width, layer, hidden, budget, **options)

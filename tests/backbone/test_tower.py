@@ -73,7 +73,7 @@ def test_the_shipped_weights_are_small_and_other_sizes_are_refused() -> None:
     with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
         build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})  # type: ignore[arg-type]
     with pytest.raises(UserError, match="layout=segments is of checkpoints"):
-        build_policy("pi05", backbone="nano", **{"backbone.vision.layout": "segments"})  # type: ignore[arg-type]
+        build_policy("pi05", backbone="nano", **{"backbone.vision.layout": "segments", "backbone.goal": "swap"})  # type: ignore[arg-type]
 
 
 def test_the_checkpoint_of_before_keeps_its_tower() -> None:

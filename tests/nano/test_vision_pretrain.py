@@ -159,7 +159,11 @@ def record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, buildable: set[int],
         return [[file.name for file in group] for group in (files, held_out)]
 
     monkeypatch.setattr(pretraining, "pretrain", names)
-    return run(compose("vision_pretrain", ["tasks=[StopCube]", "scenes=4", "held_out=1", f"output={tmp_path}", *words]))
+    return run(
+        compose(
+            "vision_pretrain", ["tasks=[StopCube]", "scenes=4", "held_out=1", "workers=1", f"output={tmp_path}", *words]
+        )
+    )
 
 
 def test_the_last_scenes_of_a_task_are_held_out_and_only_demonstrated(

@@ -21,6 +21,7 @@ from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
 EVERY = range(2**31)  # Whatever frames there are
+LONGEST_MOTION = 500  # frames by which the last motion of an episode may exceed its step limit
 LONGEST_VIDEO = 2_000  # frames; what is missing of a longer one is rendered by a second reset
 
 
@@ -106,6 +107,6 @@ class RenderPlan:
         action, most = self._robot.action, self._settings.max_steps + self._hold_steps + 2
         anywhere = action.frames is None or self._hold_steps
         if anywhere:
-            return self._read_before(exec_start + np.arange(most), exec_start)
+            return self._read_before(exec_start + np.arange(most + LONGEST_MOTION), exec_start)
         apart = min(self._settings.execute or action.execute, action.horizon)
         return frames_read(self._policy, exec_start + np.arange(0, most, apart), exec_start)
