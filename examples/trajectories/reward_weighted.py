@@ -25,7 +25,7 @@ def update(policy: MMEPolicy, optimizer: torch.optim.Optimizer, trajectories: li
         optimizer.step()
 
 
-def main(rounds: int = 8, group: int = 6, epochs: int = 4) -> tuple[float, float]:
+def main(rounds: int = 12, group: int = 6, epochs: int = 4) -> tuple[float, float]:
     """Success rates before and after."""
     policy = build_policy("pi05", backbone="nano_choice", embodiment="robomme_choice_front", seed=0)
     policy.require_processor().stats = NormStats.unit(8, 10)
