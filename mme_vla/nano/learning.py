@@ -114,8 +114,11 @@ class Reflection:
 
     @classmethod
     def of(cls, policy: MMEPolicy, p: float, goals: Sequence[str], sides: Sequence[str]) -> "Reflection | None":
-        """None with p=0. goals: of all decisions. sides: words of goals that depend on where left or forward is."""
-        if not p:
+        """None with p=0, and for a memory of the robot's joints, which stay where they are.
+
+        goals: of all decisions. sides: words of goals that depend on where left or forward is.
+        """
+        if not p or uses_proprio(policy.memory):
             return None
         require(0 < p < 1, f"learning.reflect={p} must be a probability below 1.")
         space, stats = policy.embodiment.action, policy.require_processor().stats

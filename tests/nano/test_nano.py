@@ -193,6 +193,9 @@ def test_only_decisions_whose_goal_names_no_side_are_reflected() -> None:
     assert torch.equal(batch.view_tokens[half:], samples.batch.view_tokens[half:])
     assert torch.equal(batch.actions[half:], samples.batch.actions[half:])
     assert torch.equal(batch.state, samples.batch.state)
+    joints = build_policy("actions_modul", **words)
+    joints.require_processor().stats = statistics([made], joints)
+    assert Decisions.of(joints, [made], reflect_p=0.99, sides=[]).reflection is None
     motions = nano("pi05")
     motions.require_processor().stats = statistics([demonstration()], motions)
     with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
