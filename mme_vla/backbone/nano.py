@@ -145,7 +145,7 @@ class GoalReader(nn.Module):
         kinds = len(OBJECT_CLASSES)
         self.votes = nn.Embedding(config.vocab_size, kinds)
         self.preference = nn.Parameter(PREFERENCE * torch.randn(GOAL_QUERIES, kinds))
-        self.decay = nn.Parameter(torch.arange(GOAL_QUERIES) % 2 / 1)
+        self.decay = nn.Parameter((torch.arange(GOAL_QUERIES) % 2).float())
         self.condition = nn.Linear(GOAL_QUERIES * kinds, config.action.width)
 
     def reset(self) -> None:
