@@ -178,7 +178,7 @@ class Context(NamedTuple):
     """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d].
 
     pointing: what the pointer reads: tokens of the first view [b, n, D], and the share of each class in what the goal
-    selects [b, q, K]. None without a pointer.
+    selects [b, q, K]. None without a pointer. recalls: whether there is a memory for it to recall from.
     """
 
     keys_values: Tensor
@@ -186,6 +186,7 @@ class Context(NamedTuple):
     condition: Tensor
     hook: Hook | None
     pointing: tuple[Tensor, Tensor] | None
+    recalls: bool
 
 
 @BACKBONES.register("nano")
@@ -328,14 +329,18 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         return map_noise(noise, lambda value: value.unflatten(0, (count, versions)))
 
     def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
-        """Squared error [b, h] of the chunk without its noise, the mean over its noisy versions."""
+        """The head's loss [b, h] of the chunk without its noise, the mean over its noisy versions.
+
+        In training, a policy that points at objects also learns to recall where it saw them (`Pointer.recall_loss`).
+        """
         assert batch.actions is not None
         versions = noise["noise"].shape[1]
         context = self.read_context(batch, injection)
         actions = batch.actions.repeat_interleave(versions, 0)
         flat = map_noise(noise, lambda value: value.flatten(0, 1))
         losses = self.head.loss(lambda x_t, time: self.denoise(context, x_t, time, versions), actions, flat)
-        return losses.unflatten(0, (-1, versions)).mean(1)
+        loss = losses.unflatten(0, (-1, versions)).mean(1)
+        return loss + self._recall_loss(batch, context) if self.training else loss
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
@@ -372,24 +377,40 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             selected = self.goal_reader(batch.prompt, batch.prompt_mask)
             condition = condition + self.goal_reader.condition(selected.flatten(1))
             pointing = self._view_tokens(batch, 1)[:, 0], selected
+        recalls = injection.hook is not None or any(block.name not in ("images", "prompt") for block in visible)
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
-        return Context(keys_values, mask, condition, injection.hook, pointing)
+        return Context(keys_values, mask, condition, injection.hook, pointing, recalls)
 
     def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
         """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]; behind them what points."""
+        x = self.act(context, x_t, time, versions)
+        output: Tensor = self.action_out(x)
+        if self.pointer is not None:
+            assert context.pointing is not None
+            read = (part.repeat_interleave(versions, 0) for part in context.pointing)
+            output = torch.cat([output, self.pointer(x, *read, context.recalls)], -1)
+        return output.float()
+
+    def act(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
+        """The action tokens [b·r, h, d] behind all layers."""
         condition = self.time_in(time_embedding(time, self.config.action.width))
         condition = condition + context.condition.repeat_interleave(versions, 0)
         x = self.action_in(x_t) + self.steps.weight + condition[:, None]
         for i, layer in enumerate(self.layers):
             x = layer(x, condition, *context.keys_values[i], context.mask, versions, bind_hook(context.hook, i))
-        x = self.final(x)[0]
-        output: Tensor = self.action_out(x)
-        if self.pointer is not None:
-            assert context.pointing is not None
-            read = (part.repeat_interleave(versions, 0) for part in context.pointing)
-            output = torch.cat([output, self.pointer(x, *read)], -1)
-        return output.float()
+        final: Tensor = self.final(x)[0]
+        return final
+
+    def _recall_loss(self, batch: Batch, context: Context) -> Tensor | float:
+        """`Pointer.recall_loss` [b, 1], of a policy that points and whose memory reads images; else 0."""
+        history = batch.history
+        if self.pointer is None or history is None or history.features.shape[-1] != self.vision_width:
+            return 0.0
+        assert context.pointing is not None
+        time = torch.ones(len(batch.prompt), device=batch.prompt.device)
+        actions = self.act(context, time.new_zeros(len(time), self.horizon, self.action_dim), time, 1)
+        return self.pointer.recall_loss(actions, history, context.pointing[1])[:, None]
 
     def recompute(self, mode: Recompute) -> None:
         """No effect: a layer's activations are a chunk's few tokens."""

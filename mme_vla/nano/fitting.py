@@ -222,6 +222,7 @@ def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
         policy, read(learnt), learning["elsewhere"], build_transforms(learning.get("history_transforms")),
         int(job.config["seed"]), learning["reflect"], learning["sides"],
         oversample=learning["often"], noise=learning["noise"], token_noise=learning["blur"],
+        balanced=learning["balanced"],
     )  # fmt: skip
     return samples, Decisions.of(policy, read(measured), learning["elsewhere"])
 

@@ -2,6 +2,7 @@
 
 import logging
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -166,6 +167,7 @@ class Decisions(Dataset[int]):
     token_noise: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
     reflection: puts the objects of all frames of a decision elsewhere whenever it is learned.
     replay: selects the history of a decision anew in each epoch, where transforms change the demonstrations' frames.
+    balanced: repeat the decisions of tasks that have few, so that all tasks are learned about equally often.
     """
 
     epoch = 0
@@ -180,10 +182,12 @@ class Decisions(Dataset[int]):
         token_noise: float = 0.0,
         reflection: "Reflection | None" = None,
         replay: Replay | None = None,
+        balanced: bool = False,
     ) -> None:
         self.replay, self.tasks, self.reflection = replay, tasks, reflection
         self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
-        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, oversample, 1))
+        repeats = torch.where(distant, oversample, 1) * (_to_balance(tasks) if balanced else 1)
+        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(repeats)
 
     @classmethod
     def of(
@@ -274,6 +278,12 @@ class Decisions(Dataset[int]):
         if self.batch.history is not None:
             features["past"] = self.batch.history.features[self.batch.history.mask]
         return {name: t.float().flatten(0, -2).std(0) for name, t in features.items() if t is not None}
+
+
+def _to_balance(tasks: Sequence[str]) -> Tensor:
+    """How many times each decision must occur for all tasks to have about as many as the largest. [n]."""
+    counts = Counter(tasks)
+    return torch.tensor([round(max(counts.values()) / counts[task]) for task in tasks])
 
 
 def _distant(targets: np.ndarray, min_distance: float) -> np.ndarray:

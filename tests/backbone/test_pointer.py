@@ -7,8 +7,21 @@ from torch.distributions import Categorical, Independent, MixtureSameFamily, Nor
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.choice import SPREAD, WEIGHT, ChoiceHead
 from mme_vla.backbone.pointer import Pointer
-from mme_vla.backbone.tower import CLASSES, COLUMNS, ROWS, located, reflect, reflect_points, summarise, within
+from mme_vla.backbone.tower import (
+    CLASSES,
+    COLUMNS,
+    ROWS,
+    TOKEN_WIDTH,
+    located,
+    place_waves,
+    reflect,
+    reflect_points,
+    summarise,
+    within,
+)
 from mme_vla.nano.pretraining import label_cells
+from mme_vla.testing.small import random_batch
+from mme_vla.types import HistoryTokens
 
 RED, BLUE = CLASSES.index("red cube"), CLASSES.index("blue cube")
 
@@ -114,3 +127,50 @@ def test_pointing_without_what_it_needs_is_refused(changed: dict[str, str], word
     options = {"backbone": "nano_choice", "embodiment": "robomme_choice_front", "backbone.point": "objects", **changed}
     with pytest.raises(UserError, match=words):
         build_policy("pi05", **options)
+
+
+def history_of(*frames: torch.Tensor) -> HistoryTokens:
+    """A history [1, n] of frames pooled to one token each."""
+    features = torch.stack([frame.mean(1) for frame in frames], 1)
+    rows = len(frames)
+    return HistoryTokens(features, torch.zeros(1, rows, 3), torch.ones(1, rows, dtype=torch.bool), torch.zeros(1))
+
+
+def test_the_target_of_recall_is_where_the_selected_class_was_seen() -> None:
+    pointer, selected = Pointer(8, 32, 2), torch.zeros(1, 2, len(CLASSES))
+    selected[0, 0, RED] = selected[0, 1, BLUE] = 1
+    place = torch.tensor([within(0.43, COLUMNS), within(0.31, ROWS)])
+    with torch.no_grad():
+        pointer.recall.weight.zero_()
+        pointer.recall.bias.copy_(torch.cat([place_waves(place), torch.full((16,), 9.0)]))
+    seen, empty = image_of((RED, 0.43, 0.31)), torch.zeros(1, 64, TOKEN_WIDTH)
+    # The blue cube was never seen: whatever is recalled of it is no error.
+    loss = pointer.recall_loss(torch.ones(1, 1, 8), history_of(empty, seen, empty), selected)
+    assert loss.item() < 1e-3
+    elsewhere = pointer.recall_loss(torch.ones(1, 1, 8), history_of(empty, image_of((RED, 0.6, 0.1))), selected)
+    assert elsewhere.item() > 0.1
+    assert pointer.recall_loss(torch.ones(1, 1, 8), history_of(empty, empty), selected).item() == 0
+
+
+def test_an_object_at_a_recalled_place_is_likelier() -> None:
+    pointer, action = Pointer(8, 32, 1), torch.ones(1, 1, 8)
+    place = torch.tensor([within(0.6, COLUMNS), within(0.2, ROWS)])
+    with torch.no_grad():
+        for layer in (pointer.query, pointer.counts, pointer.recall):
+            layer.weight.zero_()
+            layer.bias.zero_()
+        pointer.counts.bias.copy_(torch.tensor([9.0, 0.0]))
+        pointer.recall.bias.copy_(place_waves(place))
+    output = pointer(action, image_of((RED, 0.43, 0.31), (RED, 0.6, 0.2)), torch.full((1, 1, len(CLASSES)), 0.05))
+    logits, points = output[0, 0].tensor_split([64 * len(CLASSES)])
+    assert torch.allclose(points.view(-1, 2)[logits.argmax()], place.flip(0), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("model", "options"), [("framesamp_modul", {"memory.budget": 4, "memory.grid": 1}), ("pi05", {})]
+)
+def test_policies_with_memory_learn_to_recall(model: str, options: dict[str, int]) -> None:
+    policy = build_policy(model, backbone="nano_choice", embodiment="robomme_choice_front", **options)
+    policy.train()(random_batch(policy))[0].backward()
+    assert policy.backbone.pointer is not None
+    assert (policy.backbone.pointer.recall.weight.grad is not None) == (model == "framesamp_modul")

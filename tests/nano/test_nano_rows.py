@@ -1,5 +1,7 @@
 """A row of nanoMME: every kind of model learns from the same demonstrations, and the page tells how they did."""
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +89,17 @@ def test_the_error_is_measured_where_the_arm_goes_to_another_place(monkeypatch: 
     stats = policy.require_processor().require_stats().actions
     half = 0.5 * float(stats.q99[0] - stats.q01[0]) / 2
     assert position_error(policy, decisions).allclose(torch.full((int(decisions.distant.sum()),), half), atol=1e-4)
+
+
+def test_decisions_of_tasks_with_few_are_repeated() -> None:
+    policy = nano("pi05")
+    many, few = rendered_for(policy), replace(rendered_for(policy), task="MoveCube")
+    policy.require_processor().stats = statistics([many], policy)
+    demonstrations = [many, many, many, few]
+    decisions = Decisions.of(policy, demonstrations, balanced=True)
+    rows = Counter(decisions.tasks[decisions[item]] for item in range(len(decisions)))
+    assert rows["MoveCube"] == rows[many.task]
+    assert len(decisions) > len(Decisions.of(policy, demonstrations))
 
 
 def test_tokens_are_made_once_for_a_tower_and_again_for_other_frames_or_scores(
