@@ -10,12 +10,14 @@ import re
 import shutil
 from pathlib import Path
 
+from mme_vla.evaluation.receipts import read_receipt
 from mme_vla.evaluation.results.paper import paper_methods
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.store import RECORDS
 from mme_vla.nano import board_page
 from mme_vla.nano.board import MATCHED, Board
 from mme_vla.nano.rows import CHOICES, FILES, SCENES, read_rows, read_training
+from mme_vla.utils import with_checksum, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = ROOT / "benchmarks" / "nano16"
@@ -42,9 +44,19 @@ def add(folder: Path) -> None:
             shutil.copyfile(place / name, target / name)
         lines = b"".join(path.read_bytes() for path in sorted(place.glob("episodes*.jsonl")))
         (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
+        if (receipt := place / "receipt.json").is_file():
+            copy_receipt(receipt, target / receipt.name)
         if (scenes := place.parents[1] / SCENES).is_file():
             shutil.copyfile(scenes, table / SCENES)
         print(f"added {target.relative_to(ROOT)}")
+
+
+def copy_receipt(receipt: Path, target: Path) -> None:
+    """Copy the receipt of records, with the checkpoint's folder in its run in place of that on this machine."""
+    content = read_receipt(receipt)
+    for part in content["conditions"]:
+        part["checkpoint"]["folder"] = content["settings"].get("source")
+    write_json(target, with_checksum(content))
 
 
 def boards() -> list[Board]:

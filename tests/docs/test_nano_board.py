@@ -6,7 +6,8 @@ import nano_board
 import pytest
 
 from helpers.nano_rows import TASKS, write_training
-from mme_vla.utils import write_json
+from mme_vla.evaluation.receipts import read_receipt, verify
+from mme_vla.utils import with_checksum, write_json
 
 
 def test_the_pages_are_those_of_the_committed_rows() -> None:
@@ -22,6 +23,15 @@ def test_committed_rows_are_compressed_and_small() -> None:
     assert sum(path.stat().st_size for path in files) <= 5e6
 
 
+def test_receipts_of_committed_rows_fit_their_records() -> None:
+    for path in nano_board.ROWS.rglob("receipt.json"):
+        differences, _ = verify(path)
+        of_the_row = ("settings", "records", "score", "scenes")
+        assert not [line for line in differences if line.startswith(of_the_row)], path
+        folders = [part["checkpoint"]["folder"] or "" for part in read_receipt(path)["conditions"]]
+        assert not any(folder.startswith("/") for folder in folders), path
+
+
 def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows that are not there yet are named, and no number is written for them."""
     assert nano_board.block(None).startswith("Not run yet: `demonstrator`, ") and "|" not in nano_board.block(None)
@@ -32,7 +42,12 @@ def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch:
         write_training(tmp_path / "run", "framesamp_modul", seed, won)
     write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
     write_json(tmp_path / "run" / "scenes.json", {"split": "further", "tried": {f"{TASKS[0]} 0": ""}})
+    conditions = {"checkpoint": {"folder": "/somewhere/pi05/0", "files": {}}}
+    receipt = {"settings": {"source": "pi05/0"}, "conditions": [conditions]}
+    write_json(tmp_path / "run" / "pi05" / "0" / "receipt.json", with_checksum(receipt))
     nano_board.add(tmp_path / "run" / "pi05")
+    added = read_receipt(tmp_path / "rows" / "further" / "pi05" / "0" / "receipt.json")
+    assert added["conditions"][0]["checkpoint"]["folder"] == "pi05/0"
     assert [path.name for path in sorted((tmp_path / "rows" / "further").iterdir())] == ["pi05", "scenes.json"]
     nano_board.add(tmp_path / "run")
     (board,) = nano_board.boards()

@@ -303,7 +303,7 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
         for event, outcomes in won.items() for seed, part in enumerate(outcomes) for record in under(event, part)
     ]  # fmt: skip
     (row,) = event_table(made).rows
-    assert row[2:] == ["PickXtimes", "2", "8", "75.0 ± 35.4", "37.5 ± 17.7", "2", "4", "1", "0.375", "0"]
+    assert row[2:] == ["PickXtimes", "2", "8", "75.0 ± 35.4", "37.5 ± 17.7", "2", "4", "1", "0.500", "0"]
     assert row[0] == "m, recipe recipe, checkpoint 1, seed 7, test"
     (points,) = event_curves(made).values()
     assert [(p.turned, p.won, p.episodes) for p in points] == [(0, 6, 8), (64, 3, 8)]

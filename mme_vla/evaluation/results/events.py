@@ -63,7 +63,8 @@ def idle_events(records: Sequence[EpisodeRecord]) -> list[str]:
 def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> Table:
     """Of every recipe, event and task: both success rates, and which outcomes the event changed.
 
-    A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all trainings.
+    A rate is the mean over trainings, ± its sample standard deviation. Pairs are those of all trainings. p is a
+    sign test over scenes: one is lost, or gained, where more trainings lose it than gain it, or fewer.
     """
     merged = merge(records, conflicts)
     require(any(record.event for record in merged), NO_EVENTS)
@@ -101,7 +102,11 @@ def _counts(pairs: Sequence[Pair]) -> list[str]:
         texts = [f"{text} ± {std:.1f}" for text, std in zip(texts, rates.std(0, ddof=1), strict=True)]
     idle = sum(bool(did_not_act(record)) for record, _ in pairs)
     counts = [str(len(trainings)), str(len(pairs)), *texts, str(retained), str(lost), str(gained)]
-    return [*counts, show_p(sign_test(lost, gained)), str(idle)]
+    scenes: Counter[EpisodeKey] = Counter()
+    for record, baseline in pairs:
+        scenes[record.key] += baseline.success - record.success
+    p = sign_test(sum(balance > 0 for balance in scenes.values()), sum(balance < 0 for balance in scenes.values()))
+    return [*counts, show_p(p), str(idle)]
 
 
 def event_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
