@@ -5,6 +5,8 @@ from typing import Any
 
 from torch import nn
 
+from mme_vla.errors import brief, require
+
 CARD_FILE = "README.md"
 
 
@@ -13,8 +15,17 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
 
     Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is absent is said to be. For
     the hub's front matter also `license`, `base_model` and `datasets` (ids on the hub).
+
+    Raises:
+        UserError: `recipe` or `results` is no mapping.
     """
     name, known = str(config.get("name", "policy")), config.get("card") or {}
+    for key in ("recipe", "results"):
+        value = known.get(key) or {}
+        require(
+            isinstance(value, Mapping),
+            f"card[{key!r}]={brief(value)} must map names to values, such as {{'success (%)': 54.0}}.",
+        )
     backbone = config.get("backbone") or {}
     rows = {
         "memory": _part(config.get("memory")),

@@ -52,7 +52,7 @@ def newest_write(run: Path) -> int:
 
 LATEST = "latest"
 """`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
-SHIPPED = ("nano",)
+SHIPPED = ("nano", "nano16")
 """The checkpoints that ship with the library, folders of `mme_vla/assets` (docs/train/nano.md)."""
 
 

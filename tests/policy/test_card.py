@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from huggingface_hub import ModelCard
 
+from mme_vla import UserError
 from mme_vla.policy.card import model_card
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy, unit_stats
@@ -47,3 +48,9 @@ def test_the_example_of_a_card_runs_to_an_action(model: str, tmp_path: Path) -> 
     space: dict = {}
     exec(block.replace("<this repository or folder>", str(tmp_path)), space)
     assert space["chunk"].shape[-1] == 8
+
+
+@pytest.mark.parametrize("key", ["recipe", "results"])
+def test_a_table_of_a_card_that_is_a_text_is_refused(policy: MMEPolicy, key: str) -> None:
+    with pytest.raises(UserError, match=rf"card\['{key}'\]='54 %' must map names to values"):
+        model_card(policy, {**policy.config, "card": {key: "54 %"}})
