@@ -11,7 +11,7 @@ from mme_vla.types import HistoryTokens
 ABSENT = 1e-4  # presence that is added to every one
 UNLIKELY = 1e-3  # share that every class has in what is selected
 SEEN = 0.5  # objects of a class that a history must have shown for their places to be a target
-FRESH_SHARPNESS = 0.5
+FRESH_SHARPNESS = 0.5  # factor of the density at first: what is recalled counts little before it is learned
 
 
 class Pointer(nn.Module):
@@ -92,8 +92,8 @@ class Pointer(nn.Module):
         with torch.no_grad():
             waves = by_class(history.features.float())[..., 4:] / FACTORS[-1]  # b n K 16
             summed = torch.einsum("bqk,bnkw,bn->bqw", selected.float(), waves, history.mask.float())
-            # A token of a whole frame is the mean of 64.
-            shown = summed[..., :1]
+            shown = summed[..., :1]  # the first wave counts objects
+            # A token of a whole frame is the mean of the tower's 64.
             target, known = summed / shown.clamp(min=1e-6), shown[..., 0] > SEEN / 64
         error = (self.recalled(actions).float() - target[:, None]).square().mean((1, 3))
         return (error * known).sum(1) / known.sum(1).clamp(min=1)
