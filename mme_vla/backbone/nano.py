@@ -148,10 +148,6 @@ class GoalReader(nn.Module):
         self.decay = nn.Parameter((torch.arange(GOAL_QUERIES) % 2).float())
         self.condition = nn.Linear(GOAL_QUERIES * kinds, config.action.width)
 
-    def reset(self) -> None:
-        """Let every word begin without a vote."""
-        nn.init.zeros_(self.votes.weight)
-
     def forward(self, prompt: Tensor, mask: Tensor) -> Tensor:
         """The share of each class in what a query selects [b, q, K], of a prompt [b, l]; a query's add up to 1."""
         places = torch.arange(prompt.shape[1], device=prompt.device) / WORDS_APART
@@ -247,7 +243,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             if name != "vision":
                 initialise(module)
         if self.goal_reader is not None:
-            self.goal_reader.reset()
+            nn.init.zeros_(self.goal_reader.votes.weight)  # every word begins without a vote
         # The pointer has its own fresh weights.
         self.pointer = Pointer(action_width, width, GOAL_QUERIES) if config.point == "objects" else None
         self.make_head(config)
@@ -376,7 +372,8 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         if self.goal_reader is not None:
             selected = self.goal_reader(batch.prompt, batch.prompt_mask)
             condition = condition + self.goal_reader.condition(selected.flatten(1))
-            pointing = self._view_tokens(batch, 1)[:, 0], selected
+            if self.pointer is not None:
+                pointing = self._view_tokens(batch, 1)[:, 0], selected
         recalls = injection.hook is not None or any(block.name not in ("images", "prompt") for block in visible)
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
