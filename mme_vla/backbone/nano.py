@@ -174,7 +174,7 @@ class Context(NamedTuple):
     """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d].
 
     pointing: what the pointer reads: tokens of the first view [b, n, D], and the share of each class in what the goal
-    selects [b, q, K]. None without a pointer. recalls: whether there is a memory for it to recall from.
+    selects [b, q, K]. None without a pointer. has_memory: whether an integration adds one.
     """
 
     keys_values: Tensor
@@ -182,7 +182,7 @@ class Context(NamedTuple):
     condition: Tensor
     hook: Hook | None
     pointing: tuple[Tensor, Tensor] | None
-    recalls: bool
+    has_memory: bool
 
 
 @BACKBONES.register("nano")
@@ -327,7 +327,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
     def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
         """The head's loss [b, h] of the chunk without its noise, the mean over its noisy versions.
 
-        In training, a policy that points at objects also learns to recall where it saw them (`Pointer.recall_loss`).
+        Training adds the localization loss of a policy that points at objects (`Pointer.localization_loss`).
         """
         assert batch.actions is not None
         versions = noise["noise"].shape[1]
@@ -336,7 +336,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         flat = map_noise(noise, lambda value: value.flatten(0, 1))
         losses = self.head.loss(lambda x_t, time: self.denoise(context, x_t, time, versions), actions, flat)
         loss = losses.unflatten(0, (-1, versions)).mean(1)
-        return loss + self._recall_loss(batch, context) if self.training else loss
+        return loss + self._localization_loss(batch, context) if self.training else loss
 
     def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
@@ -374,10 +374,10 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
             condition = condition + self.goal_reader.condition(selected.flatten(1))
             if self.pointer is not None:
                 pointing = self._view_tokens(batch, 1)[:, 0], selected
-        recalls = injection.hook is not None or any(block.name not in ("images", "prompt") for block in visible)
+        has_memory = injection.hook is not None or any(block.name not in ("images", "prompt") for block in visible)
         if batch.state is not None:
             condition = condition + self.state_in(_waves(batch.state.float()))
-        return Context(keys_values, mask, condition, injection.hook, pointing, recalls)
+        return Context(keys_values, mask, condition, injection.hook, pointing, has_memory)
 
     def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
         """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]; behind them what points."""
@@ -386,7 +386,7 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         if self.pointer is not None:
             assert context.pointing is not None
             read = (part.repeat_interleave(versions, 0) for part in context.pointing)
-            output = torch.cat([output, self.pointer(x, *read, context.recalls)], -1)
+            output = torch.cat([output, self.pointer(x, *read, context.has_memory)], -1)
         return output.float()
 
     def act(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
@@ -399,15 +399,15 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
         final: Tensor = self.final(x)[0]
         return final
 
-    def _recall_loss(self, batch: Batch, context: Context) -> Tensor | float:
-        """`Pointer.recall_loss` [b, 1], of a policy that points and whose memory reads images; else 0."""
+    def _localization_loss(self, batch: Batch, context: Context) -> Tensor | float:
+        """`Pointer.localization_loss` [b, 1], of a policy that points and whose memory reads images; else 0."""
         history = batch.history
         if self.pointer is None or history is None or history.features.shape[-1] != self.vision_width:
             return 0.0
         assert context.pointing is not None
         time = torch.ones(len(batch.prompt), device=batch.prompt.device)
         actions = self.act(context, time.new_zeros(len(time), self.horizon, self.action_dim), time, 1)
-        return self.pointer.recall_loss(actions, history, context.pointing[1])[:, None]
+        return self.pointer.localization_loss(actions, history, context.pointing[1])[:, None]
 
     def recompute(self, mode: Recompute) -> None:
         """No effect: a layer's activations are a chunk's few tokens."""

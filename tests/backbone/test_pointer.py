@@ -136,7 +136,7 @@ def history_of(*frames: torch.Tensor) -> HistoryTokens:
     return HistoryTokens(features, torch.zeros(1, rows, 3), torch.ones(1, rows, dtype=torch.bool), torch.zeros(1))
 
 
-def test_the_target_of_recall_is_where_the_selected_class_was_seen() -> None:
+def test_the_target_of_a_map_is_where_the_history_shows_the_selected_class() -> None:
     pointer, selected = Pointer(8, 32, 2), torch.zeros(1, 2, len(CLASSES))
     selected[0, 0, RED] = selected[0, 1, BLUE] = 1
     place = torch.tensor([within(0.43, COLUMNS), within(0.31, ROWS)])
@@ -144,15 +144,15 @@ def test_the_target_of_recall_is_where_the_selected_class_was_seen() -> None:
         pointer.recall.weight.zero_()
         pointer.recall.bias.copy_(torch.cat([place_waves(place), torch.full((16,), 9.0)]))
     seen, empty = image_of((RED, 0.43, 0.31)), torch.zeros(1, 64, TOKEN_WIDTH)
-    # The blue cube was never seen: whatever is recalled of it is no error.
-    loss = pointer.recall_loss(torch.ones(1, 1, 8), history_of(empty, seen, empty), selected)
+    # No frame shows the blue cube: its map is no error.
+    loss = pointer.localization_loss(torch.ones(1, 1, 8), history_of(empty, seen, empty), selected)
     assert loss.item() < 1e-3
-    elsewhere = pointer.recall_loss(torch.ones(1, 1, 8), history_of(empty, image_of((RED, 0.6, 0.1))), selected)
+    elsewhere = pointer.localization_loss(torch.ones(1, 1, 8), history_of(empty, image_of((RED, 0.6, 0.1))), selected)
     assert elsewhere.item() > 0.1
-    assert pointer.recall_loss(torch.ones(1, 1, 8), history_of(empty, empty), selected).item() == 0
+    assert pointer.localization_loss(torch.ones(1, 1, 8), history_of(empty, empty), selected).item() == 0
 
 
-def test_an_object_at_a_recalled_place_is_likelier() -> None:
+def test_an_object_at_a_place_of_high_density_is_likelier() -> None:
     pointer, action = Pointer(8, 32, 1), torch.ones(1, 1, 8)
     place = torch.tensor([within(0.6, COLUMNS), within(0.2, ROWS)])
     with torch.no_grad():
@@ -169,7 +169,7 @@ def test_an_object_at_a_recalled_place_is_likelier() -> None:
 @pytest.mark.parametrize(
     ("model", "options"), [("framesamp_modul", {"memory.budget": 4, "memory.grid": 1}), ("pi05", {})]
 )
-def test_policies_with_memory_learn_to_recall(model: str, options: dict[str, int]) -> None:
+def test_policies_with_memory_have_a_localization_loss(model: str, options: dict[str, int]) -> None:
     policy = build_policy(model, backbone="nano_choice", embodiment="robomme_choice_front", **options)
     policy.train()(random_batch(policy))[0].backward()
     assert policy.backbone.pointer is not None
