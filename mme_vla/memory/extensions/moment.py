@@ -40,6 +40,7 @@ class Moment(FrameMemory):
         pooling: str = "mean",
         stride: int = 16,
         every: int = 1,
+        *,
         layers: int = 2,
         hidden: int | None = None,
         heads: int | None = None,
