@@ -277,15 +277,22 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.
         state = tuple(tensor.contiguous() for tensor in start)
+        # On a CPU a window takes no part in chunks before its first frame. A GPU would have to wait to know which.
+        skips = x.device.type == "cpu" and not (self.reporting or compiled or torch.compiler.is_compiling())
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             counted = following if window is None else min(following, window)
-            inputs = (state, part.contiguous(), real.contiguous(), counted, self.reporting)
+            rows = real.any(1).nonzero()[:, 0] if skips else slice(None)
+            before = tuple(tensor[rows] for tensor in state)
+            inputs = (before, part[rows].contiguous(), real[rows].contiguous(), counted, self.reporting)
             if torch.is_grad_enabled():
-                state, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
+                after, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
-                state, numbers = step(*inputs)
+                after, numbers = step(*inputs)
+            if skips:
+                after = tuple(whole.index_copy(0, rows, new) for whole, new in zip(state, after, strict=True))
+            state = after
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
