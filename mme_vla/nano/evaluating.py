@@ -292,7 +292,7 @@ def built_scenes(
             break
         for key, reason in carry_out(missing, tried_scene, workers):
             known[key] = reason
-            write_json(file, {"split": split, "tried": known})
+            write_json(file, {"split": split, "tried": dict(sorted(known.items()))})
     left_out = [f"{key}: {reason}" for key, reason in sorted(known.items()) if reason]
     return [spec for task in names for spec in good[task][:count]], left_out
 

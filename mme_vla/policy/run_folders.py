@@ -91,6 +91,11 @@ def resolve_checkpoint(path: Path) -> Path:
             f"mme-vla weights {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
             "where no history_config.txt names the variant)."
         )
+    require(
+        str(path) not in SHIPPED,
+        f"The folder {path} holds no checkpoint, and hides the one that ships under this name: rename it, or run the "
+        "command in another folder.",
+    )
     raise UserError(
         f"No checkpoint at {path}: expected a folder such as outputs/<model>/<date>/checkpoints/step_000500, "
         "or the run folder above it."

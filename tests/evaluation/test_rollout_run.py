@@ -190,6 +190,10 @@ def test_environments_that_cannot_begin_stop_the_run() -> None:
     envs.kind = "RuntimeError"
     with pytest.raises(UserError, match="8 environments in a row"):
         roll(quick_policy("pi05"), JOBS, envs)
+    envs = Broken(2)
+    envs.kind = "SceneError"
+    many = [Job("VideoPlaceOrder", "reserved", episode) for episode in range(12)]
+    assert [record.outcome for record in roll(quick_policy("pi05"), many, envs)] == ["error"] * 12
 
 
 def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp_path: Path) -> None:

@@ -133,6 +133,13 @@ def test_shipped_checkpoints_are_small_and_whole(name: str) -> None:
     assert MMEPolicy.from_pretrained(name).require_processor().stats is not None
 
 
+def test_a_folder_that_hides_a_shipped_checkpoint_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nano16").mkdir()
+    with pytest.raises(UserError, match="hides the one that ships under this name"):
+        resolve_checkpoint(Path("nano16"))
+
+
 def test_policies_of_earlier_versions_highlight_what_the_goal_names_first_in_images_and_memory() -> None:
     policy = MMEPolicy.from_pretrained("nano")
     assert policy.backbone.config.goal == "swap"

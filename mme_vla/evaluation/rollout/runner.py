@@ -180,13 +180,16 @@ class Rollout:
         if reply.done:
             if not reply.crashed:
                 running.end(reply.info)
-            self._stillborn += not running.chunks
+            # A scene in which an object finds no place finds none again, and says nothing of the simulator.
+            unbuildable = reply.info.get("exception_type") == "SceneError"
+            self._stillborn += not (running.chunks or unbuildable)
             require(
                 self._stillborn < GIVE_UP_AFTER,
                 f"{self._stillborn} environments in a row could not be started, so the run stops; the last one: "
                 f"{reply.info.get('error_message')}",
             )
-            self._finish(running, str(reply.info.get("status")), reply.info.get("error_message"))
+            message = reply.info.get("error_message")
+            self._finish(running, str(reply.info.get("status")), message, retry=not unbuildable)
             return
         if reply.reward is None:
             self._stillborn = 0
