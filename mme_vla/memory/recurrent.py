@@ -283,16 +283,15 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             counted = following if window is None else min(following, window)
-            rows = real.any(1).nonzero()[:, 0] if skips else slice(None)
-            before = tuple(tensor[rows] for tensor in state)
-            inputs = (before, part[rows].contiguous(), real[rows].contiguous(), counted, self.reporting)
+            rows = real.any(1).nonzero()[:, 0] if skips else None
+            entering = (*state, part, real) if rows is None else tuple(t[rows] for t in (*state, part, real))
+            *before, part, real = (tensor.contiguous() for tensor in entering)
+            inputs = (tuple(before), part, real, counted, self.reporting)
             if torch.is_grad_enabled():
                 after, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
                 after, numbers = step(*inputs)
-            if skips:
-                after = tuple(whole.index_copy(0, rows, new) for whole, new in zip(state, after, strict=True))
-            state = after
+            state = after if rows is None else _with_rows(state, rows, after)
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
@@ -399,6 +398,10 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         count = valid.sum().clamp(min=1)
         names = statistics[0] if statistics else {}
         return {name: (torch.cat([s[name] for s in statistics], 1) * valid).sum() / count for name in names}
+
+
+def _with_rows(state: State, rows: Tensor, new: State) -> State:
+    return tuple(whole.index_copy(0, rows, part) for whole, part in zip(state, new, strict=True))
 
 
 def _stack(states: Sequence[State]) -> State:
