@@ -198,6 +198,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         every: int = 1,
         jitter: int = 0,
         chunk: int = 8,
+        recompute: bool = True,
         position_dim: int | None = None,
         position_hidden: int | None = None,
         positions: str | None = None,
@@ -213,6 +214,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
             jitter: in training, past frames move at random by up to this many frames, if the data hand over
                 randomness (`data.jitter`).
             chunk: frames that are recomputed together in the backward pass; windows are padded to a multiple of it.
+            recompute: False keeps what the backward pass needs: faster, and the memory of all chunks instead of one.
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
             positions: of `POSITIONS`; None: `time_space`.
         """
@@ -228,7 +230,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         self.budget, self.capacity = budget, max_steps * grid**2
         self.storage = StorageSpec(grid, pooling)
         self.max_steps, self.max_video, self.stride, self.every = max_steps, max_video, stride, every
-        self.jitter, self.chunk = jitter, chunk
+        self.jitter, self.chunk, self.recompute = jitter, chunk, recompute
         self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden, positions)
         self.layer = layer
         self._compiled: Callable[..., tuple[State, Statistics]] | None = None
@@ -266,7 +268,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
     def run(self, x: Tensor, valid: Tensor) -> MemoryTokens:
         """Run the recurrence over encoded frames [b, t, p, d], of which `valid` [b, t] are real.
 
-        Gradients flow through every step. Between chunks only the state is kept for the backward pass.
+        Gradients flow through every step. With `recompute` only the states between chunks are kept for them.
         """
         # Statistics are wanted of one update in many: not worth compiling for.
         compiled = None if self.reporting else self._compiled
@@ -287,7 +289,7 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
             entering = (*state, part, real) if rows is None else tuple(t[rows] for t in (*state, part, real))
             *before, part, real = (tensor.contiguous() for tensor in entering)
             inputs = (tuple(before), part, real, counted, self.reporting)
-            if torch.is_grad_enabled():
+            if torch.is_grad_enabled() and self.recompute:
                 after, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
                 after, numbers = step(*inputs)

@@ -142,10 +142,10 @@ def test_selections_of_different_length_stack(make):
     assert torch.allclose(both.tokens[0][short.mask[0]], short.tokens[short.mask], atol=TOLERANCE)
 
 
-def test_chunks_change_neither_numbers_nor_gradients(make):
+def test_chunks_and_recomputation_change_neither_numbers_nor_gradients(make):
     results = []
-    for chunk in (1, 3, 64):
-        memory = make(chunk=chunk)
+    for options in ({"chunk": 1}, {"chunk": 3}, {"chunk": 64}, {"recompute": False}):
+        memory = make(**options)
         out = memory(window(memory, 200))
         loss = (out.tokens * out.mask[..., None]).square().sum()
         gradients = torch.autograd.grad(loss, memory.parameters())
