@@ -39,7 +39,9 @@ class Row:
 
     @property
     def kind(self) -> str:
-        """A `policy` with memory, a `floor` or a `ceiling`."""
+        """A `policy` with memory, a `floor` or a `ceiling`, as one is that reads the simulator's subgoals."""
+        if self.method.subgoal == "oracle":
+            return "ceiling"
         return "floor" if self.name.partition(" ")[0] in FLOORS else self.facts.kind
 
     @property

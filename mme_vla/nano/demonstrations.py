@@ -182,11 +182,10 @@ def record(
             if chooser is None
             else chooser.worded(env.goals()[0].lower(), _options(env, chooser))
         )
-        texts = [taken.texts[frame] for frame in motions.decisions]
+        subgoals = {kind: _subgoal_texts(taken.texts, motions.decisions, kind) for kind in SUBGOALS}
         return Demonstration(
             type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
-            np.stack(taken.states), motions, images, {kind: _subgoal_texts(texts, kind) for kind in SUBGOALS},
-            _boundaries(taken.texts),
+            np.stack(taken.states), motions, images, subgoals, _boundaries(taken.texts),
         )  # fmt: skip
     finally:
         env.close()
@@ -279,11 +278,16 @@ def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None"
     return None
 
 
-def _subgoal_texts(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
-    """The subgoal at each decision; where the simulator names none, the last one stays."""
+def _subgoal_texts(texts: Sequence[Mapping[str, Any]], decisions: np.ndarray, kind: str) -> list[str]:
+    """The subgoal at each decision; where the simulator names none, the last one stays.
+
+    At the frame that ends a video the simulator may name none yet. The next one stands there, which an environment
+    reports after its reset.
+    """
+    named = [online_subgoal(text, kind) for text in texts]
     result: list[str] = []
-    for text in texts:
-        result.append(online_subgoal(text, kind) or (result[-1] if result else ""))
+    for frame in decisions:
+        result.append(named[frame] or (result[-1] if result else next(filter(None, named[frame:]), "")))
     return result
 
 

@@ -81,6 +81,15 @@ def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> 
     assert board.noise(["BinFill"]) == pytest.approx(board.noise())
 
 
+def test_policies_that_read_the_simulators_subgoals_are_ceilings(rows: Path, tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "simplesg", 0, 3)
+    write_records(folder, [replace(record, subgoal="oracle") for record in records_of(folder)])
+    board = Board(read_rows([rows, tmp_path]), samples=50)
+    assert row_of(board, "simplesg").kind == "ceiling" and "simplesg" not in board.places
+    assert {s.memories for s in board.separations()} == {3}
+    assert "(framesamp_modul)" in board.targets()[0].measured
+
+
 def test_users_rows_are_compared_with_the_rows_beside_the_best_and_the_floors(rows: Path, tmp_path: Path) -> None:
     write_training(tmp_path, "mine", 0, {"BinFill": 3, "VideoUnmask": 2})
     board = Board(read_rows([rows], local=[tmp_path]), samples=50)

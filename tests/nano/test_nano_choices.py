@@ -3,6 +3,7 @@
 import pytest
 
 from mme_vla import build_policy
+from mme_vla.envs.make import make_env
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
@@ -24,3 +25,17 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
     assert across[0] == across[2] < across[1] == across[3]  # right of the robot is left in the image
     assert made.boundaries is not None and len(made.boundaries) == len(letters) + 1, "after the last one it is over"
     assert set(made.motions.decisions.tolist()) == set(made.images["front"])
+
+
+def test_the_first_subgoal_after_a_video_is_the_one_that_a_policy_is_told() -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    made = record("MoveCube", 3_000_001, "easy", [], ["front"], acts=ROBOT.action)
+    env = make_env("MoveCube", seed=3_000_001, difficulty="easy", action_space="multi_choice", render=False)
+    _, info = env.reset()
+    env.close()
+    assert made is not None
+    assert made.subgoals["simple"] == [info["simple_subgoal_online"].lower(), "place the cube onto the target"]
