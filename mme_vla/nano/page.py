@@ -25,15 +25,15 @@ def write_page(
     config: Mapping[str, Any],
     records: Mapping[str, Sequence[EpisodeRecord]],
     without: str | None,
-    minutes: Mapping[str, Sequence[float]],
+    minutes: Mapping[str, float],
     videos: Sequence[Path],
     runs: Mapping[str, Sequence[Path]],
 ) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
     records: of each model, the one with memory first, and of the oracle planner. without: the one without memory, which
-    all others are compared with. minutes: of each stage, on the clock and of processors. videos: one of a success, one
-    of a failure, as far as there are such. runs: of each model, the folders of its trainings.
+    all others are compared with. minutes: of each stage, on the clock. videos: one of a success, one of a failure,
+    as far as there are such. runs: of each model, the folders of its trainings.
     """
     ends = {model: [read_json(run / DONE, "a training's end") for run in folders] for model, folders in runs.items()}
     results, comparisons = compared(records, config["task"], config["split"], without)

@@ -1,7 +1,6 @@
 """A run of nanoMME: demonstrations, tokens, trainings and evaluations of all rows, each as far as it is not there."""
 
 import logging
-import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -46,7 +45,7 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     folder, workers = Path(config["output"]), config["workers"]
     folder.mkdir(parents=True, exist_ok=True)
     rows = compose_rows(config, extra_dirs)
-    minutes = Minutes(folder / "minutes.json")
+    minutes = Minutes(folder / "clock.json")
     with minutes.of("demonstrations"):
         files = record_all(config, folder / "demonstrations", rows.choices, rows.robot)
     if until < STAGES.index("tokens"):
@@ -313,31 +312,24 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
     return [file for group in groups for file in group.files]
 
 
-def processor_seconds() -> float:
-    """Seconds of processors that this process and those of its processes that ended have used."""
-    return sum(os.times()[:4])
-
-
 class Minutes:
-    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors (`processor_seconds`)."""
+    """Minutes of each stage on the clock, added up over interrupted runs."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     @property
-    def spent(self) -> dict[str, list[float]]:
-        """Stage → minutes on the clock, and of processors; other runs of the command may add to them meanwhile."""
+    def spent(self) -> dict[str, float]:
+        """Stage → minutes; other runs of the command may add to them meanwhile."""
         return read_json(self._path, "minutes of a run") if self._path.is_file() else {}
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
         """Time what happens inside; a stage that had nothing to do counts its moment."""
-        begun = time.perf_counter(), processor_seconds()
+        begun = time.perf_counter()
         try:
             yield
         finally:
-            now = time.perf_counter(), processor_seconds()
+            minutes = (time.perf_counter() - begun) / 60
             spent = self.spent
-            before = spent.get(stage, [0.0, 0.0])
-            spent[stage] = [old + (b - a) / 60 for old, a, b in zip(before, begun, now, strict=True)]
-            write_json(self._path, spent)
+            write_json(self._path, {**spent, stage: spent.get(stage, 0.0) + minutes})
