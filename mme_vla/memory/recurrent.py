@@ -279,13 +279,16 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.
         state = tuple(tensor.contiguous() for tensor in start)
-        # On a CPU a window takes no part in chunks before its first frame. A GPU would have to wait to know which.
+        # On a CPU a list takes no part in chunks before its first frame, unless their outputs are handed over. A GPU
+        # would have to wait to know which.
         skips = x.device.type == "cpu" and not (self.reporting or compiled or torch.compiler.is_compiling())
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             counted = following if window is None else min(following, window)
-            rows = real.any(1).nonzero()[:, 0] if skips else None
+            rows = None
+            if skips and window is not None and following >= window:
+                rows = valid[:, : x.shape[1] - following].any(1).nonzero()[:, 0]
             entering = (*state, part, real) if rows is None else tuple(t[rows] for t in (*state, part, real))
             *before, part, real = (tensor.contiguous() for tensor in entering)
             inputs = (tuple(before), part, real, counted, self.reporting)
