@@ -37,6 +37,19 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 @pytest.fixture(scope="session")
+def renderer() -> str:
+    """The device that renders; skips where there is none."""
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    from mme_vla.envs.rendering import render_backend
+    from mme_vla.errors import UserError
+
+    try:
+        return render_backend()
+    except UserError as error:
+        pytest.skip(f"cannot render here: {error}")
+
+
+@pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder with specifications and reference data that developers have beside the repository."""
     return _folder("MME_VLA_SHARED", REPOSITORY.parent / "shared", "reference data")

@@ -42,18 +42,6 @@ def hand(env: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     return Hand(env, monkeypatch)
 
 
-@pytest.fixture(scope="session")
-def renderer() -> str:
-    """The device that renders; skips where there is none."""
-    from mme_vla.envs.rendering import render_backend
-    from mme_vla.errors import UserError
-
-    try:
-        return render_backend()
-    except UserError as error:
-        pytest.skip(f"cannot render here: {error}")
-
-
 @pytest.fixture
 def make_unrendered() -> Iterator[Build]:
     """`make_env` without images, by default of one training episode; closed when the test ends."""

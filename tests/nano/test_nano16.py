@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from mme_vla import UserError, build_policy
+from mme_vla import build_policy
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
-from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.nano import evaluating
@@ -162,12 +161,7 @@ def test_floors_and_ceilings_are_played_and_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_learns_two_tasks_and_continues_in_a_fresh_process(tmp_path: Path) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+def test_the_command_learns_two_tasks_and_continues_in_a_fresh_process(tmp_path: Path, renderer: str) -> None:
     words = [
         "nano=nano16", "task=[StopCube,MoveCube]", "model=framesamp_modul", "beside=[pi05]", "drawn_for=[]",
         "demonstrations={easy: 2, medium: 0, hard: 0}", "trainings=1", "train.batch_size=2", "train.steps=3",

@@ -6,20 +6,13 @@ import pytest
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env
-from mme_vla.envs.rendering import render_backend
-from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
 from mme_vla.nano.evaluating import replay
 
 SCENE = {"seed": 3_000_001, "difficulty": "easy"}
 
 
-def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand(renderer: str) -> None:
     made = record("SwingXtimes", choices=[], cameras=[], carried_out=True, **SCENE)  # type: ignore[arg-type]
     assert made is not None
     env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]

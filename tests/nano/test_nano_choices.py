@@ -1,22 +1,13 @@
 """Demonstrations of choices, for robots that choose among options; and the scenes of the counting row."""
 
-import pytest
-
 from mme_vla import build_policy
 from mme_vla.envs.make import make_env
-from mme_vla.envs.rendering import render_backend
-from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
 
 ROBOT = build_policy("pi05", backbone="tiny", embodiment="robomme_choice_front").embodiment
 
 
-def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_options() -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_options(renderer: str) -> None:
     made = record("SwingXtimes", 3_000_001, "easy", [], ["front"], acts=ROBOT.action)
     assert made is not None and "two times" in made.goal and "Options: a pick up the cube" in made.goal
     letters = "".join("abcdefgh"[row] for row in made.motions.targets[:, :8].argmax(1))
@@ -27,12 +18,7 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
     assert set(made.motions.decisions.tolist()) == set(made.images["front"])
 
 
-def test_the_first_subgoal_after_a_video_is_the_one_that_a_policy_is_told() -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(str(error))
+def test_the_first_subgoal_after_a_video_is_the_one_that_a_policy_is_told(renderer: str) -> None:
     made = record("MoveCube", 3_000_001, "easy", [], ["front"], acts=ROBOT.action)
     env = make_env("MoveCube", seed=3_000_001, difficulty="easy", action_space="multi_choice", render=False)
     _, info = env.reset()
