@@ -279,8 +279,8 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.
         state = tuple(tensor.contiguous() for tensor in start)
-        # On a CPU a list takes no part in chunks before its first frame, unless their outputs are handed over. A GPU
-        # would have to wait to know which.
+        # A CPU skips the windows that have no frame yet, unless `read` hands over this chunk. A GPU would synchronise
+        # to know which.
         skips = x.device.type == "cpu" and not (self.reporting or compiled or torch.compiler.is_compiling())
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
@@ -296,7 +296,9 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
                 after, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
                 after, numbers = step(*inputs)
-            state = after if rows is None else _with_rows(state, rows, after)
+            if rows is not None:
+                after = tuple(old.index_copy(0, rows, new) for old, new in zip(state, after, strict=True))
+            state = after
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
@@ -403,10 +405,6 @@ class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPre
         count = valid.sum().clamp(min=1)
         names = statistics[0] if statistics else {}
         return {name: (torch.cat([s[name] for s in statistics], 1) * valid).sum() / count for name in names}
-
-
-def _with_rows(state: State, rows: Tensor, new: State) -> State:
-    return tuple(whole.index_copy(0, rows, part) for whole, part in zip(state, new, strict=True))
 
 
 def _stack(states: Sequence[State]) -> State:
