@@ -113,10 +113,15 @@ def _names(names: list[str]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--add", type=Path, help="folder <output>/<split> of a run, or a row in it, to copy first")
-    args = parser.parse_args()
-    if args.add:
-        add(args.add)
+    parser.add_argument(
+        "--add",
+        type=Path,
+        nargs="+",
+        default=[],
+        help="folders <output>/<split> of runs, or rows in them, to copy first",
+    )
+    for folder in parser.parse_args().add:
+        add(folder)
     made = boards()
     for path, text in pages(made).items():
         path.write_text(text)
