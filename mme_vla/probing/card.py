@@ -1,7 +1,7 @@
 """The report card of a checkpoint: is its memory more than a clock, and how does it recover from a wrong one?"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,8 @@ class Recovery:
 class Card:
     """Everything a card shows. noise: share of scenes that end otherwise in an equal run with other noise.
 
-    writing: score of writing (`mme_vla.probing.writing`). references: success of other runs on the same scenes.
+    suites: the memory-or-clock score of each suite's scenes, where they are of several. writing: score of writing
+    (`mme_vla.probing.writing`). references: success of other runs on the same scenes.
     """
 
     model: str
@@ -107,6 +108,7 @@ class Card:
     noise: float
     arms: dict[str, Loss]
     memory_or_clock: ClockScore
+    suites: Mapping[str, ClockScore] = field(default_factory=dict)
     recovery: Recovery | None = None
     writing: dict[str, Any] | None = None
     references: dict[str, float] | None = None
@@ -158,10 +160,11 @@ def run_card(
     if isinstance(writing, str):
         notes.append(writing)
     matched, repeated = _outcomes(folder / ONLINE / slug(UNPROBED.name), plan), _outcomes(folder / AGAIN, plan)
-    card = grade(matched, {x: _outcomes(folder / ONLINE / slug(arms[x].name), plan) for x in possible}, repeated)
+    outcomes = {label: _outcomes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
     card = replace(
-        card, model=facts.model, checkpoint=facts.checkpoint, recovery=recovered, references=others, notes=notes,
-        writing=writing if isinstance(writing, dict) else None,
+        grade(matched, outcomes, repeated), model=facts.model, checkpoint=facts.checkpoint,
+        suites=clock_scores(matched, outcomes, repeated, environment(settings.env).suite_of),
+        recovery=recovered, references=others, notes=notes, writing=writing if isinstance(writing, dict) else None,
     )  # fmt: skip
     write_card(card, folder)
     return card
@@ -208,6 +211,24 @@ def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -
     low, high = np.quantile(share(sampled[TIME], sampled[CONTENT]), _TAILS)
     score = share(np.array([losses[TIME].loss]), np.array([losses[CONTENT].loss]))
     return ClockScore(float(score[0]), float(low), float(high))
+
+
+def clock_scores(
+    matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes, suite_of: Callable[[str], str | None]
+) -> dict[str, ClockScore]:
+    """The memory-or-clock score of each suite's scenes; none where all are of one. The rest is as `grade` has it."""
+
+    def part(outcomes: Outcomes, suite: str | None) -> Outcomes:
+        return {key: value for key, value in outcomes.items() if suite_of(key.task) == suite}
+
+    suites = {suite_of(key.task) for key in matched if all(key in outcomes for outcomes in (again, *arms.values()))}
+    if len(suites) < 2:
+        return {}
+    graded = {
+        suite: grade(part(matched, suite), {label: part(arm, suite) for label, arm in arms.items()}, part(again, suite))
+        for suite in suites
+    }
+    return {suite: graded[suite].memory_or_clock for suite in sorted(filter(None, suites))}
 
 
 def recovery(moments: Sequence[MomentLine]) -> Recovery | None:
@@ -283,9 +304,9 @@ def _writing(policy: Policy, plan: ProbePlan) -> dict[str, Any] | str:
 
 def tables_of(card: Card) -> list[Table]:
     """The card as tables."""
-    score, after = card.memory_or_clock, card.recovery
-    defined = f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]" if score.undefined is None else ""
-    rows = [["memory-or-clock score", defined or f"undefined: {score.undefined}"]]
+    after = card.recovery
+    rows = [["memory-or-clock score", _score(card.memory_or_clock)]]
+    rows += [[f"memory-or-clock score, {suite}", _score(score)] for suite, score in card.suites.items()]
     rows.append(["noise: scenes that end otherwise in an equal run", _percent(card.noise)])
     if after is not None:
         median = "no" if after.median is None else f"{after.median:g} decisions"
@@ -319,6 +340,12 @@ def write_card(card: Card, folder: Path) -> None:
 def card_text(card: Card) -> str:
     """The card in Markdown."""
     return "\n".join([*map(to_markdown, tables_of(card)), *card.notes])
+
+
+def _score(score: ClockScore) -> str:
+    if score.undefined is not None:
+        return f"undefined: {score.undefined}"
+    return f"{score.score:.2f} [{score.low:.2f}, {score.high:.2f}]"
 
 
 def _percent(share: float) -> str:

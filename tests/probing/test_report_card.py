@@ -28,6 +28,7 @@ from mme_vla.probing.card import (
     TIME,
     Recovery,
     card_text,
+    clock_scores,
     grade,
     outcomes_of,
     recovery,
@@ -159,6 +160,20 @@ def test_the_score_is_undefined_where_both_losses_lie_within_noise() -> None:
     assert score.score == pytest.approx(4 / 6) and score.low is not None and score.high is not None
     assert score.low < 4 / 6 < score.high <= 1
     assert grade(matched, {TIME: scenes([0] * 12)}, matched).memory_or_clock.undefined is not None
+
+
+def test_each_suite_has_a_score_of_its_own() -> None:
+    def outcomes(counting: int, permanence: int) -> dict[EpisodeKey, float]:
+        solved = {"PickXtimes": counting, "VideoUnmask": permanence}
+        return {EpisodeKey(task, i): float(i < n) for task, n in solved.items() for i in range(8)}
+
+    matched, suites = outcomes(8, 8), {"PickXtimes": "Counting", "VideoUnmask": "Permanence"}
+    arms = {TIME: outcomes(0, 8), CONTENT: outcomes(8, 0)}
+    scores = clock_scores(matched, arms, matched, suites.get)
+    assert {suite: score.score for suite, score in scores.items()} == {"Counting": 1.0, "Permanence": 0.0}
+    card = replace(grade(matched, arms, matched), suites=scores)
+    assert card.memory_or_clock.score == 0.5 and "memory-or-clock score, Counting | 1.00" in card_text(card)
+    assert clock_scores(matched, arms, matched, {}.get) == {}, "all are of one"
 
 
 def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
