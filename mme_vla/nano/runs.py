@@ -225,7 +225,7 @@ def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
     """How many demonstrations of each task and difficulty."""
     counts: dict[tuple[str, str], int] = {}
     for task in choose_tasks(config["task"]):
-        amounts = {**config["demonstrations"], **config["demonstrations_of"].get(task, {})}
+        amounts = {**config["demonstrations"], **(config["demonstrations_of"] or {}).get(task, {})}
         fits = set(amounts) <= set(LEVELS) and all(isinstance(n, int) and n >= 0 for n in amounts.values())
         require(
             fits,

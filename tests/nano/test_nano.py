@@ -97,6 +97,7 @@ def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) ->
         "demonstrations_of": {"BinFill": {"hard": 1}},
     }
     assert counts_of(more) == {("StopCube", "easy"): 2, ("BinFill", "easy"): 2, ("BinFill", "hard"): 1}
+    assert counts_of({**more, "demonstrations_of": None}) == {("StopCube", "easy"): 2, ("BinFill", "easy"): 2}
 
 
 def test_a_tasks_settings_come_with_its_name_unless_others_are_named(
