@@ -12,6 +12,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
+from mme_vla.evaluation.results.scopes import TASK_FACTS
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -161,9 +162,14 @@ def run_card(
         notes.append(writing)
     matched, repeated = _outcomes(folder / ONLINE / slug(UNPROBED.name), plan), _outcomes(folder / AGAIN, plan)
     outcomes = {label: _outcomes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    source = environment(settings.env)
+    suites = {
+        job.task: TASK_FACTS[job.task].suite if job.task in TASK_FACTS else source.suite_of(job.task)
+        for job in plan.jobs
+    }
     card = replace(
         grade(matched, outcomes, repeated), model=facts.model, checkpoint=facts.checkpoint,
-        suites=clock_scores(matched, outcomes, repeated, environment(settings.env).suite_of),
+        suites=clock_scores(matched, outcomes, repeated, suites),
         recovery=recovered, references=others, notes=notes, writing=writing if isinstance(writing, dict) else None,
     )  # fmt: skip
     write_card(card, folder)
@@ -214,21 +220,27 @@ def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -
 
 
 def clock_scores(
-    matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes, suite_of: Callable[[str], str | None]
+    matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes, suites: Mapping[str, str | None]
 ) -> dict[str, ClockScore]:
-    """The memory-or-clock score of each suite's scenes; none where all are of one. The rest is as `grade` has it."""
+    """The memory-or-clock score of each suite's scenes; none where all are of one.
+
+    suites: task → suite. The rest is as `grade` has it.
+    """
 
     def part(outcomes: Outcomes, suite: str | None) -> Outcomes:
-        return {key: value for key, value in outcomes.items() if suite_of(key.task) == suite}
+        return {key: value for key, value in outcomes.items() if suites.get(key.task) == suite}
 
-    suites = {suite_of(key.task) for key in matched if all(key in outcomes for outcomes in (again, *arms.values()))}
-    if len(suites) < 2:
+    known = {key for key in matched if all(key in outcomes for outcomes in (again, *arms.values()))}
+    names = dict.fromkeys(suites.get(key.task) for key in matched if key in known)
+    if len(names) < 2:
         return {}
-    graded = {
-        suite: grade(part(matched, suite), {label: part(arm, suite) for label, arm in arms.items()}, part(again, suite))
-        for suite in suites
+    return {
+        name: grade(
+            part(matched, name), {label: part(arm, name) for label, arm in arms.items()}, part(again, name)
+        ).memory_or_clock
+        for name in names
+        if name is not None
     }
-    return {suite: graded[suite].memory_or_clock for suite in sorted(filter(None, suites))}
 
 
 def recovery(moments: Sequence[MomentLine]) -> Recovery | None:

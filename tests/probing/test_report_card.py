@@ -1,7 +1,7 @@
 """The report card tells a policy that reads time from one that reads content."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers import REPOSITORY
 from helpers.probe_fakes import SIDE, MadeUpSource
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
 from helpers.scripted_env import ScriptedEnv
@@ -17,11 +18,13 @@ from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import verify
 from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.evaluation.results.scopes import TASK_FACTS
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing import card as card_module
-from mme_vla.probing.arms import read_arm
+from mme_vla.probing.arms import read_arm, slug
 from mme_vla.probing.card import (
     ARMS,
     CONTENT,
@@ -40,6 +43,7 @@ from mme_vla.probing.lines import MomentLine
 from mme_vla.probing.offline import OfflineSettings
 from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.probing.run import ProbePlan
+from mme_vla.utils import to_json
 
 JOBS = [Job("VideoUnmask", "test", episode) for episode in range(8)]
 VIDEO = (5, 21)  # frames of the video of a scene, by its right choice
@@ -169,11 +173,32 @@ def test_each_suite_has_a_score_of_its_own() -> None:
 
     matched, suites = outcomes(8, 8), {"PickXtimes": "Counting", "VideoUnmask": "Permanence"}
     arms = {TIME: outcomes(0, 8), CONTENT: outcomes(8, 0)}
-    scores = clock_scores(matched, arms, matched, suites.get)
+    scores = clock_scores(matched, arms, matched, suites)
     assert {suite: score.score for suite, score in scores.items()} == {"Counting": 1.0, "Permanence": 0.0}
     card = replace(grade(matched, arms, matched), suites=scores)
     assert card.memory_or_clock.score == 0.5 and "memory-or-clock score, Counting | 1.00" in card_text(card)
-    assert clock_scores(matched, arms, matched, {}.get) == {}, "all are of one"
+    assert clock_scores(matched, arms, matched, {}) == {}, "all are of one"
+
+
+@pytest.mark.parametrize("name", ["framesamp_modul", "tokendrop_modul", "anchors_modul", "ttt_modul"])
+def test_a_committed_card_follows_from_its_records(name: str) -> None:
+    folder = REPOSITORY / "benchmarks" / "clock" / "nano16" / "cards" / name
+    figures = json.loads((folder / "card.json").read_text())
+
+    def outcomes(part: str) -> dict[EpisodeKey, float]:
+        return outcomes_of(read_folders(find_records([folder / part])))
+
+    matched, again = outcomes("online/unprobed"), outcomes("again")
+    arms = {label: outcomes(f"online/{slug(read_arm(ARMS[label]).name)}") for label in figures["arms"]}
+    card = grade(matched, arms, again)
+    assert card.scenes == figures["scenes"] == 30
+    for label, loss in card.arms.items():
+        assert to_json(asdict(loss)) == pytest.approx(figures["arms"][label]), label
+    scores = clock_scores(matched, arms, again, {task: facts.suite for task, facts in TASK_FACTS.items()})
+    assert set(scores) == {"Counting", "Permanence"}
+    for suite, score in {"": card.memory_or_clock, **scores}.items():
+        told = figures["suites"][suite] if suite else figures["memory_or_clock"]
+        assert to_json(asdict(score)) == pytest.approx(told), suite
 
 
 def test_recovery_counts_decisions_until_nothing_changes_any_more() -> None:
