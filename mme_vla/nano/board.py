@@ -285,9 +285,9 @@ def pooled(groups: Sequence[np.ndarray]) -> float | None:
 def homogeneity(groups: Sequence[np.ndarray], permutations: int = PERMUTATIONS, seed: int = 0) -> float:
     """P that memories which do not differ would differ as much: a permutation test of the variance between them.
 
-    groups: of each memory, outcomes [scenes, trainings]. Where a memory has several trainings, trainings change places
-    between memories: they are what another training would change. Otherwise outcomes do within each scene, which tests
-    these policies alone.
+    groups: of each memory, outcomes [scenes, trainings]. Where every memory has several trainings, trainings change
+    places between memories: they are what another training would change. Otherwise outcomes do within each scene, which
+    tests these policies alone.
     """
     outcomes = np.concatenate(groups, 1)  # scenes × trainings of all memories
     sizes = [group.shape[1] for group in groups]
@@ -298,7 +298,7 @@ def homogeneity(groups: Sequence[np.ndarray], permutations: int = PERMUTATIONS, 
         """Of the memories' means, from trainings' means [..., trainings]."""
         return (np.add.reduceat(means, starts, -1) ** 2 / sizes).sum(-1)
 
-    if max(sizes) > 1:
+    if min(sizes) > 1:
         permuted = rng.permuted(np.tile(outcomes.mean(0), (permutations, 1)), axis=1)
     else:
         permuted = np.zeros((permutations, outcomes.shape[1]))

@@ -132,6 +132,9 @@ def test_tasks_that_separate_memories_stand_out() -> None:
     alike = [rng.random((20, 3)) < 0.5 for _ in range(5)]
     assert homogeneity(alike, 999) > 0.05
     assert homogeneity([group[:, :1] for group in apart], 999) == pytest.approx(0.001)
+    assert homogeneity([apart[0], *(group[:, :1] for group in apart[1:])], 999) == pytest.approx(0.001), "one of three"
+    mixed = [alike[0], *(group[:, :1] for group in alike[1:])]
+    assert homogeneity(mixed, 999) > 0.05
 
 
 def test_no_false_alarm_where_trainings_differ_as_much_as_memories() -> None:
