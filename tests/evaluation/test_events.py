@@ -308,6 +308,7 @@ def test_trainings_of_a_recipe_are_one_row_and_one_curve() -> None:
     (points,) = event_curves(made).values()
     assert [(p.turned, p.won, p.episodes) for p in points] == [(0, 6, 8), (64, 3, 8)]
     assert distinct_parts(["m, recipe a, seed 7", "m, recipe b, seed 7"]) == ["recipe a", "recipe b"]
+    assert distinct_parts(["m, recipe a, seed 7"]) == ["m"]
     assert points[0].interval == Interval(*(100 * bound for bound in wilson(0.75, 4, 0.95))), "of four scenes"
 
 

@@ -123,9 +123,9 @@ def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> 
 
 
 def distinct_parts(runs: Sequence[str]) -> list[str]:
-    """The names of runs without what all of them share, for a legend."""
+    """The names of runs without what all of them share, for a legend; of one run its first part, the model."""
     parts = [run.split(", ") for run in runs]
-    shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set[str]()
+    shared = set.intersection(*map(set, parts)) if len(parts) > 1 else set(parts[0][1:])
     return [", ".join(part for part in its if part not in shared) for its in parts]
 
 
