@@ -230,8 +230,8 @@ def clock_scores(
     def part(outcomes: Outcomes, suite: str | None) -> Outcomes:
         return {key: value for key, value in outcomes.items() if suites.get(key.task) == suite}
 
-    known = {key for key in matched if all(key in outcomes for outcomes in (again, *arms.values()))}
-    names = dict.fromkeys(suites.get(key.task) for key in matched if key in known)
+    others = (again, *arms.values())
+    names = dict.fromkeys(suites.get(key.task) for key in matched if all(key in outcomes for outcomes in others))
     if len(names) < 2:
         return {}
     return {
