@@ -12,7 +12,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
-from mme_vla.evaluation.results.scopes import TASK_FACTS
+from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import Table, to_markdown
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -162,11 +162,8 @@ def run_card(
         notes.append(writing)
     matched, repeated = _outcomes(folder / ONLINE / slug(UNPROBED.name), plan), _outcomes(folder / AGAIN, plan)
     outcomes = {label: _outcomes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
-    source = environment(settings.env)
-    suites = {
-        job.task: TASK_FACTS[job.task].suite if job.task in TASK_FACTS else source.suite_of(job.task)
-        for job in plan.jobs
-    }
+    suite_of = environment(settings.env).suite_of
+    suites = {job.task: suite for job in plan.jobs if (suite := suite_of(job.task))}
     card = replace(
         grade(matched, outcomes, repeated), model=facts.model, checkpoint=facts.checkpoint,
         suites=clock_scores(matched, outcomes, repeated, suites),
@@ -220,26 +217,27 @@ def clock_score(losses: Mapping[str, Loss], sampled: Mapping[str, np.ndarray]) -
 
 
 def clock_scores(
-    matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes, suites: Mapping[str, str | None]
+    matched: Outcomes, arms: Mapping[str, Outcomes], again: Outcomes, task_suites: Mapping[str, str]
 ) -> dict[str, ClockScore]:
     """The memory-or-clock score of each suite's scenes; none where all are of one.
 
-    suites: task → suite. The rest is as `grade` has it.
+    task_suites: task → suite, of environments that are not RoboMME. The rest is as `grade` has it.
     """
 
-    def part(outcomes: Outcomes, suite: str | None) -> Outcomes:
-        return {key: value for key, value in outcomes.items() if suites.get(key.task) == suite}
+    def select(outcomes: Outcomes, tasks: Sequence[str]) -> Outcomes:
+        return {key: value for key, value in outcomes.items() if key.task in tasks}
 
     others = (again, *arms.values())
-    names = dict.fromkeys(suites.get(key.task) for key in matched if all(key in outcomes for outcomes in others))
-    if len(names) < 2:
+    names = dict.fromkeys(key.task for key in matched if all(key in outcomes for outcomes in others))
+    protocol = Protocol(tuple(names), task_suites=task_suites)
+    suites = {suite: protocol.choose("suite", suite) for suite in protocol.suites}
+    if len(suites) < 2:
         return {}
     return {
-        name: grade(
-            part(matched, name), {label: part(arm, name) for label, arm in arms.items()}, part(again, name)
+        suite: grade(
+            select(matched, tasks), {label: select(arm, tasks) for label, arm in arms.items()}, select(again, tasks)
         ).memory_or_clock
-        for name in names
-        if name is not None
+        for suite, tasks in suites.items()
     }
 
 
