@@ -113,13 +113,8 @@ def _names(names: list[str]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--add",
-        type=Path,
-        nargs="+",
-        default=[],
-        help="folders <output>/<split> of runs, or rows in them, to copy first",
-    )
+    how = "folders <output>/<split> of runs, or rows in them, to copy first"
+    parser.add_argument("--add", type=Path, nargs="+", default=[], help=how)
     for folder in parser.parse_args().add:
         add(folder)
     made = boards()

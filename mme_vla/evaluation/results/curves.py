@@ -1,7 +1,7 @@
 """A curve instead of a point: success over how far a dial of `split=stress:…` is turned; the test split is its zero."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -105,21 +105,36 @@ def stress_figures(curves: Curves, unit: str = "more than in the benchmark") -> 
     """For each task and dial a curve of every run, as SVG."""
     figures = {}
     for task, dial in dict.fromkeys((task, dial) for _, task, dial in sorted(curves)):
-        mine = {run: points for (run, its, of), points in curves.items() if (its, of) == (task, dial)}
-        labels = distinct_parts(list(mine))
-        with figure((5.6, 3.0 + 0.2 * len(mine))) as (canvas, (axes,)):
-            for i, points in enumerate(mine.values()):
-                rates = [p.rate for p in points]
-                below = [max(p.rate - p.interval.low, 0) for p in points]
-                above = [max(p.interval.high - p.rate, 0) for p in points]
-                axes.errorbar([p.turned for p in points], rates, [below, above], fmt="-o", ms=5, capsize=3,
-                              color=COLOURS[i % len(COLOURS)], label=labels[i])  # fmt: skip
-            axes.set_xlabel(f"{dial}: {unit}")
-            axes.set_ylabel("success (%)")
-            axes.set_ylim(0, 100)
-            canvas.legend(fontsize=8, loc="outside lower left")
-            figures[f"{task}, {dial}"] = svg(canvas)
+        runs = {
+            run: [(p.turned, p.rate, p.interval) for p in points]
+            for (run, its, of), points in curves.items()
+            if (its, of) == (task, dial)
+        }
+        figures[f"{task}, {dial}"] = curve_figure(runs, f"{dial}: {unit}")
     return figures
+
+
+def curve_figure(
+    runs: Mapping[str, Sequence[tuple[float, float, Interval]]], label: str, training: tuple[float, float] | None = None
+) -> str:
+    """Success over an amount, a curve of every run, as SVG.
+
+    runs: name → amount, success in percent and its interval. label: of the amount. training: its shaded range.
+    """
+    with figure((5.6, 3.0 + 0.2 * (len(runs) + (training is not None)))) as (canvas, (axes,)):
+        if training is not None:
+            axes.axvspan(*training, color="0.9", label="training range")
+        for i, (name, points) in enumerate(zip(distinct_parts(list(runs)), runs.values(), strict=True)):
+            amounts, rates, intervals = zip(*points, strict=True)
+            below = [max(rate - interval.low, 0) for rate, interval in zip(rates, intervals, strict=True)]
+            above = [max(interval.high - rate, 0) for rate, interval in zip(rates, intervals, strict=True)]
+            axes.errorbar(amounts, rates, [below, above], fmt="-o", ms=5, capsize=3, color=COLOURS[i % len(COLOURS)],
+                          label=name)  # fmt: skip
+        axes.set_xlabel(label)
+        axes.set_ylabel("success (%)")
+        axes.set_ylim(0, 100)
+        canvas.legend(fontsize=8, loc="outside lower left")
+        return svg(canvas)
 
 
 def distinct_parts(runs: Sequence[str]) -> list[str]:

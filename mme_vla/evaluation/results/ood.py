@@ -17,9 +17,8 @@ from mme_vla.envs.rows import OOD, TIERS
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Interval, repeated_episodes, wilson
-from mme_vla.evaluation.results.curves import distinct_parts
+from mme_vla.evaluation.results.curves import curve_figure
 from mme_vla.evaluation.results.paper import paper_table
-from mme_vla.evaluation.results.plots import COLOURS, figure, svg
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
 from mme_vla.evaluation.results.tables import Table
 
@@ -230,18 +229,10 @@ def extrapolation_figures(curves: Extrapolation) -> dict[str, str]:
     figures = {}
     for task in dict.fromkeys(task for _, task in sorted(curves)):
         kind, _, (least, most) = AMOUNTS[task]
-        mine = {run: points for (run, of), points in curves.items() if of == task}
-        labels = distinct_parts(list(mine))
-        with figure((5.6, 3.2 + 0.2 * len(mine))) as (canvas, (axes,)):
-            axes.axvspan(least - 0.5, most + 0.5, color="0.9", label="training range")
-            for i, points in enumerate(mine.values()):
-                below = [max(share.rate - share.interval.low, 0) for share in points.values()]
-                above = [max(share.interval.high - share.rate, 0) for share in points.values()]
-                axes.errorbar(list(points), [share.rate for share in points.values()], [below, above], fmt="-o", ms=5,
-                              capsize=3, color=COLOURS[i % len(COLOURS)], label=labels[i])  # fmt: skip
-            axes.set_xlabel(kind)
-            axes.set_ylabel("success (%)")
-            axes.set_ylim(0, 100)
-            canvas.legend(fontsize=8, loc="outside lower left")
-            figures[f"{task}, {kind}"] = svg(canvas)
+        runs = {
+            run: [(amount, share.rate, share.interval) for amount, share in points.items()]
+            for (run, of), points in curves.items()
+            if of == task
+        }
+        figures[f"{task}, {kind}"] = curve_figure(runs, kind, (least - 0.5, most + 0.5))
     return figures
