@@ -1,5 +1,6 @@
-"""Images: rendered where they are requested, by a renderer that stays, equal with fewer triangles and shader tables."""
+"""Images: rendered where they are requested, by a renderer that stays, equal without what no camera sees."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,11 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 import sapien
 from PIL import Image
+from sapien.render import RenderBodyComponent
 
 from helpers.env_scenes import Scene
 from mme_vla.envs import make_env, rendering
-from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.observations import SENSORS, RenderRequest, capture, read_images
 from mme_vla.envs.rendering import PACK, renderer_works, without_table
 from mme_vla.envs.robot import robots
 from mme_vla.envs.robot.robots import CELL, coarsen, read_stl, stl_bytes
@@ -173,6 +175,35 @@ def test_nothing_but_the_table_leaves_the_shaders_and_unknown_ones_are_unchanged
     rendering._pipeline_folder.cache_clear()
     assert rendering.lean_shaders() is None
     rendering._pipeline_folder.cache_clear()
+
+
+# What is out of sight -----------------------------------------------------------------------------------------------
+
+
+def test_hiding_links_out_of_sight_and_reading_without_a_copy_change_no_pixel(software: dict[str, object]) -> None:
+    scene = Scene(lambda _: None, **software)
+    scene.reset()
+    rng, hidden = np.random.default_rng(0), Counter[str]()
+    for _ in range(12):
+        offset = np.append(rng.uniform(-0.6, 0.6, 7), [0, 0]).astype(np.float32)
+        scene.agent.robot.set_qpos(SHOWN_FROM_THE_FRONT + offset)
+        for name, sensor_name in SENSORS.items():
+            capture(scene, [name])
+            actual = read_images(scene, name, rgb=True, depth=True, segmentation=True)
+            sensor = scene.scene.sensors[sensor_name]
+            with scene.rendering(sensor.camera):
+                bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in links(scene)]
+                hidden[name] += sum(body is not None and not body.visibility for body in bodies)
+            assert all(body is None or body.visibility == 1 for body in bodies)
+            sensor.capture()
+            for kind, image in sensor.get_obs(position=False).items():
+                assert np.array_equal(actual[kind], image[0].numpy()), (name, kind)
+    assert hidden["front"] > 36 and hidden["wrist"] > 36, "few of 12 x 12 links are ever hidden"
+    scene.close()
+
+
+def links(scene: Scene) -> list[sapien.Entity]:
+    return [link._objs[0].entity for link in scene.agent.robot.links]
 
 
 # Meshes -------------------------------------------------------------------------------------------------------------

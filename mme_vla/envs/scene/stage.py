@@ -1,6 +1,7 @@
 """The stage of a task: robot, table, cameras and the step counter."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,9 +11,11 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
+from mani_skill.utils.structs.render_camera import RenderCamera
+from sapien.render import RenderBodyComponent
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.envs.rendering import keep_renderer, lean_shaders
+from mme_vla.envs.rendering import culled, keep_renderer, lean_shaders
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.things import Thing, pose_of
 
@@ -91,6 +94,14 @@ class Stage(BaseEnv):
             self._custom_sensor_configs = {} if lean is None else {"shader_config": lean}
         super()._setup_sensors(options)
         self._custom_sensor_configs = configs
+
+    def rendering(self, camera: RenderCamera) -> AbstractContextManager[None]:
+        """While a camera renders on the CPU, links that it cannot see are hidden."""
+        if not self._render_device.is_cpu():
+            return nullcontext()
+        links = (link._objs[0].entity for link in self.agent.robot.links)
+        bodies = [link.find_component_by_type(RenderBodyComponent) for link in links]
+        return culled([body for body in bodies if body is not None], camera._render_cameras[0])
 
     def set_up(self) -> None:
         """Put up the table, with nothing on it."""
