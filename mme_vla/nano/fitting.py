@@ -1,6 +1,5 @@
 """One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
 
-import hashlib
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from omegaconf import OmegaConf
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose, import_plugins, resolved
+from mme_vla.config.naming import digest
 from mme_vla.config.plugins import plugins_of
+from mme_vla.embodiment.action_space import ActionSpace
 from mme_vla.errors import UserError
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.nano.demonstrations import Demonstration
@@ -126,7 +126,7 @@ def train(job: Training) -> Path:
         if job.tower_seed != int(job.config["seed"]):
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
-        policy.config[TRAINING] = identify(full_config, content_of(job.files))
+        policy.config[TRAINING] = identify(full_config, content_of(job.files, policy.embodiment.action))
         policy.config["card"] = {"data": f"{len(job.files)} demonstrations", "recipe": dict(settings)}
         validation = Validation(
             val_set, val_set.collate, train_settings.val_samples, train_settings.batch_size, train_settings.seed
@@ -197,13 +197,19 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
     return best | {"accuracy": None, "off_by": None, "off_by_m": position_error(policy, val_set).tolist()}
 
 
-def content_of(files: Sequence[Path]) -> list[str]:
-    """Digests of demonstrations: of their states and motions, whichever frames are rendered."""
+def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
+    """Digests of demonstrations: of their scenes, goals, decisions and the letters that they choose.
+
+    They are the same on every machine. States and poses differ in their last bits between processors.
+    """
     digests = []
     for file in files:
         made = Demonstration.load(file, images=False)
-        parts = (made.states, made.motions.decisions, made.motions.targets)
-        digests.append(hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest())
+        targets = made.motions.targets
+        letters = targets[:, list(acts.choice)].argmax(1).tolist() if acts.choice else None
+        facts = {"decisions": len(targets), "letters": letters}
+        facts |= {name: getattr(made, name) for name in ("task", "seed", "difficulty", "goal")}
+        digests.append(digest(facts, 64))
     return digests
 
 

@@ -3,6 +3,7 @@
 A folder holds `config.yaml`, `run.json`, `trained.json` and `episodes.jsonl` (or `episodes.jsonl.xz`). Each file names
 what it is of. Files of different trainings, scenes or settings are one error. `scenes.json` beside the rows says which
 scenes of the split can be built: a row has the first so many of these of each task, by default of all.
+`same_data.json` there gives digests of demonstrations that are the same: an earlier digest → the present one.
 """
 
 from collections import Counter
@@ -24,7 +25,7 @@ from mme_vla.utils import read_json, read_text
 
 CONFIG, TRAINED = "config.yaml", "trained.json"
 FILES = (CONFIG, RUN_FILE, TRAINED)
-SCENES = "scenes.json"
+SCENES, SAME_DATA = "scenes.json", "same_data.json"
 CHOICES = "multi_choice"
 """The action space of the benchmark's own table; rows of another one have a table of their own."""
 _SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "seed": "model_seed"}
@@ -160,6 +161,10 @@ def read_training(folder: Path) -> Training:
     settings = run["settings"]
     n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
     rules = f"action_space={records[0].action_space}, max_choices={n_choices}, only_possible={possible}"
+    digests = folder.parent.parent / SAME_DATA
+    if digests.is_file() and facts.data in (same := read_json(digests, "digests of the same demonstrations")):
+        facts = replace(facts, data=same[facts.data])
+        records = [replace(record, training=facts.identity) for record in records]
     return Training(folder, facts, _numbered(folder, records), rules)
 
 

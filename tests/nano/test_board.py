@@ -327,6 +327,17 @@ def test_trainings_of_a_row_are_of_one_recipe_and_not_copies(tmp_path: Path) -> 
         read_rows([tmp_path / "b"])
 
 
+def test_demonstrations_with_two_digests_are_the_same_where_the_table_says_so(tmp_path: Path) -> None:
+    write_training(tmp_path, "a", 0, 3)
+    other = write_training(tmp_path, "a", 1, 1, data="earlier")
+    write_records(other, [replace(r, training=TrainingIdentity(1, "r", "earlier", "a1")) for r in records_of(other)])
+    with pytest.raises(UserError, match="data is d and earlier"):
+        read_rows([tmp_path])
+    write_json(tmp_path / "same_data.json", {"earlier": "d"})
+    assert [training.facts.data for training in read_rows([tmp_path])["a"]] == ["d", "d"]
+    assert Board(read_rows([tmp_path]), samples=20).rows[0].average.std > 0, "they are two rows"
+
+
 def test_a_folder_without_rows_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no row"):
         read_rows([tmp_path])

@@ -5,11 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from helpers.nano_policies import demonstration
 from mme_vla.cli.nano import with_settings
 from mme_vla.config.composition import compose, resolved
+from mme_vla.data.waypoints import Motions
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.nano import evaluating, fitting, runs, tokens
 from mme_vla.nano.demonstrations import Demonstration
@@ -77,10 +80,20 @@ def test_minutes_of_a_stage_add_up_over_runs(tmp_path: Path) -> None:
     assert minutes.spent["training"] >= 2 * 0.02 / 60 and set(minutes.spent) == {"training", "evaluation"}
 
 
-def test_the_digest_of_demonstrations_does_not_depend_on_rendered_frames(tmp_path: Path) -> None:
-    files = [tmp_path / "a.npz", tmp_path / "b.npz"]
-    made = demonstration((0, 15, 39))
-    made.save(files[0])
-    replace(made, images={"front": {0: made.images["front"][0]}}).save(files[1])
-    assert len(set(fitting.content_of(files))) == 1
-    assert Demonstration.load(files[0]).length == 180
+def test_the_digest_of_demonstrations_is_of_their_scenes_and_choices(tmp_path: Path) -> None:
+    made, acts = demonstration((0, 15, 39)), ROBOMME_JOINT.action
+    variants = {
+        "a": made,
+        "rendered elsewhere": replace(made, images={"front": {0: made.images["front"][0]}}),
+        "another processor": replace(made, states=np.nextafter(made.states, np.float32(9))),
+        "another goal": replace(made, goal=f"{made.goal} twice"),
+        "one decision fewer": replace(made, motions=Motions(made.motions.decisions[1:], made.motions.targets[1:])),
+    }
+    for name, variant in variants.items():
+        variant.save(tmp_path / f"{name}.npz")
+    digests = dict(
+        zip(variants, fitting.content_of([tmp_path / f"{name}.npz" for name in variants], acts), strict=True)
+    )
+    same = {name for name, digest in digests.items() if digest == digests["a"]}
+    assert same == {"a", "rendered elsewhere", "another processor"}
+    assert Demonstration.load(tmp_path / "a.npz").length == 180
