@@ -174,7 +174,8 @@ def culled(
 
     A software renderer spends a millisecond on each link of the robot whose triangles all lie outside the image.
     """
-    hidden = [(body, body.visibility) for body in bodies if _is_beyond(camera, body.get_global_aabb_fast())]
+    beyond = _beyond(camera, np.array([body.get_global_aabb_fast() for body in bodies]).reshape(-1, 2, 3))
+    hidden = [(body, body.visibility) for body, flag in zip(bodies, beyond, strict=True) if flag]
     try:
         for body, _ in hidden:
             body.visibility = 0.0
@@ -184,10 +185,11 @@ def culled(
             body.visibility = visibility
 
 
-def _is_beyond(camera: "sapien.render.RenderCameraComponent", box: np.ndarray) -> bool:
-    """Whether a box, its lowest and highest corner [2, 3] in the world, lies beyond one edge of the camera's image."""
+def _beyond(camera: "sapien.render.RenderCameraComponent", boxes: np.ndarray) -> np.ndarray:
+    """Which boxes lie beyond one edge of the camera's image, [n]; boxes: lowest and highest corner, [n, 2, 3]."""
     view = camera.global_pose.inv().to_transformation_matrix()
-    corners = np.array(list(product(*np.asarray(box).T)))
-    x, y, z = view[:3, :3] @ corners.T + view[:3, 3:]  # forward, left, up
+    corners = np.stack([boxes[:, ends, range(3)] for ends in product((0, 1), repeat=3)], 1)  # [n, 8, 3]
+    x, y, z = np.moveaxis(corners @ view[:3, :3].T + view[:3, 3], -1, 0)  # forward, left, up
     right, top = x * np.tan(camera.fovx / 2), x * np.tan(camera.fovy / 2)
-    return bool(np.any(np.all(np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN, axis=1)))
+    outside = np.stack([y - right, -y - right, z - top, -z - top]) > MARGIN  # [4, n, 8]
+    return np.any(np.all(outside, axis=-1), axis=0)
