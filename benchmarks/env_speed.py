@@ -57,7 +57,7 @@ class Parts:
         scene.update_render = self._timed("rendering", scene.update_render)
         for sensor in scene.sensors.values():
             sensor.capture = self._timed("rendering", sensor.capture)
-        # What was drawn is waited for where it is read, so that half of the drawing's time is spent here.
+        # Rendering continues in the background until an image is read: this is the other part of its time.
         observations._read_texture = self._timed("waiting for images", observations._read_texture)
 
     def _timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""The renderer: the device it runs on, its shaders, links out of sight, and the engine that lives as the process."""
+"""The renderer: its device and shaders, culling of links, and the engine that is kept for the life of the process."""
 
 import hashlib
 import logging

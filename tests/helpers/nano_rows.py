@@ -31,6 +31,7 @@ def write_training(
     model, trained = row.partition("@")[0], facts.pop("trained", True)
     budget = int(row.partition("@")[2] or 32)
     identity = {"recipe": "r", "data": "d", "weights": f"{row}{seed}"} if trained else {}
+    identity |= {name: facts.pop(name) for name in identity.keys() & facts.keys()}
     config = {"name": model, "backbone": {"name": "nano"}, "memory": {"name": model, "budget": budget}}
     settings = {"model": model, "checkpoint": 100, "seed": 7, "split": SPLIT, "max_steps": 500}
     claim_run(folder, settings)
