@@ -37,7 +37,7 @@ class Demonstration:
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
     subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
     time. images: camera → frame → [256, 256, 3] uint8. boundaries: frames at which a sub-task begins, of the video too;
-    None in files of earlier versions.
+    None in files of earlier versions. carried_out: whether its motions were carried out one by one, see `record`.
     """
 
     task: str
@@ -51,10 +51,11 @@ class Demonstration:
     images: dict[str, dict[int, np.ndarray]]
     subgoals: dict[str, list[str]] = field(default_factory=dict)
     boundaries: np.ndarray | None = None
+    carried_out: bool = False
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
-        names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals")
+        names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals", "carried_out")
         about = {name: getattr(self, name) for name in names}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
         if self.boundaries is not None:
@@ -185,7 +186,7 @@ def record(
         subgoals = {kind: _subgoal_texts(taken.texts, motions.decisions, kind) for kind in SUBGOALS}
         return Demonstration(
             type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
-            np.stack(taken.states), motions, images, subgoals, _boundaries(taken.texts),
+            np.stack(taken.states), motions, images, subgoals, _boundaries(taken.texts), carried_out,
         )  # fmt: skip
     finally:
         env.close()

@@ -198,7 +198,7 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
 
 
 def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
-    """Digests of demonstrations: of their scenes, goals, decisions and the letters that they choose.
+    """Digests of demonstrations: of their scenes, goals, numbers of decisions and letters, and `carried_out`.
 
     They are the same on every machine. States and poses differ in their last bits between processors.
     """
@@ -209,6 +209,7 @@ def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
         letters = targets[:, list(acts.choice)].argmax(1).tolist() if acts.choice else None
         facts = {"decisions": len(targets), "letters": letters}
         facts |= {name: getattr(made, name) for name in ("task", "seed", "difficulty", "goal")}
+        facts |= {"carried_out": True} if made.carried_out else {}  # others keep the digest they had without it
         digests.append(digest(facts, 64))
     return digests
 

@@ -86,6 +86,7 @@ def test_the_digest_of_demonstrations_is_of_their_scenes_and_choices(tmp_path: P
         "a": made,
         "rendered elsewhere": replace(made, images={"front": {0: made.images["front"][0]}}),
         "another processor": replace(made, states=np.nextafter(made.states, np.float32(9))),
+        "carried out": replace(made, carried_out=True),
         "another goal": replace(made, goal=f"{made.goal} twice"),
         "one decision fewer": replace(made, motions=Motions(made.motions.decisions[1:], made.motions.targets[1:])),
     }
