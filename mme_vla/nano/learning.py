@@ -17,7 +17,7 @@ from mme_vla.backbone.nano import NanoBackbone
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.backbone.tower import reflect, reflect_points
 from mme_vla.data.columns import BOUNDARY, SUBTASK, with_labels
-from mme_vla.embodiment.action_space import MIDDLE
+from mme_vla.embodiment.action_space import MIDDLE, ActionSpace
 from mme_vla.errors import require
 from mme_vla.memory.base import Memory, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
@@ -97,6 +97,19 @@ class Replay:
         return stack_history(items)
 
 
+def check_reflection(p: float, space: ActionSpace, layout: str | None) -> None:
+    """Raise UserError unless decisions can be learned at mirrored places with probability p.
+
+    layout: of the tokens of a nano backbone's tower (`backbone.vision.layout`); None of another backbone.
+    """
+    require(0 <= p < 1, f"learning.reflect={p} must be a probability below 1.")
+    require(
+        not p or (len(space.point) == 2 and layout == "places"),
+        f"learning.reflect={p} needs a point in the image and located objects: set learning.reflect=0, or "
+        "embodiment=robomme_choice_front and backbone=nano_choice.",
+    )
+
+
 @dataclass(frozen=True)
 class Reflection:
     """Mirrors the places of a decision's objects, in its images, its memory and its point alike.
@@ -121,14 +134,9 @@ class Reflection:
         """
         if not p or uses_proprio(policy.memory):
             return None
-        require(0 < p < 1, f"learning.reflect={p} must be a probability below 1.")
         space, stats = policy.embodiment.action, policy.require_processor().stats
-        places = isinstance(policy.backbone, NanoBackbone) and policy.backbone.config.vision.layout == "places"
-        require(
-            len(space.point) == 2 and places and stats is not None,
-            f"learning.reflect={p} needs a point in the image and located objects: set learning.reflect=0, or "
-            "embodiment=robomme_choice_front and backbone=nano_choice.",
-        )
+        backbone = policy.backbone
+        check_reflection(p, space, backbone.config.vision.layout if isinstance(backbone, NanoBackbone) else None)
         assert stats is not None
         columns = list(space.point)
         low, high = (torch.as_tensor(end, dtype=torch.float32)[columns] for end in stats.actions.bounds("quantiles"))

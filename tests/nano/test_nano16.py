@@ -15,6 +15,7 @@ from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs import metadata
 from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.nano import evaluating
 from mme_vla.nano.demonstrations import Demonstration
@@ -78,6 +79,11 @@ def test_planned_motions_of_several_tasks_are_one_run() -> None:
     rows = compose_rows(config)
     assert rows.robot.action.answers == "waypoint" and rows.blind == "pi05" and len(config["task"]) == 5
     assert {each["backbone"]["name"] for each in rows.composed.values()} == {"nano"}
+
+
+def test_mirrored_places_of_motions_are_refused_before_anything_is_recorded() -> None:
+    with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
+        compose_rows(resolved(compose("nano", ["nano=motions", "learning.reflect=0.5"])))
 
 
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
