@@ -270,9 +270,7 @@ class Decisions(Dataset[int]):
         assert batch.state is not None and batch.view_tokens is not None
         fixed = {"views": VIEW_NOISE * self.noise, "past": self.noise}
         size = {name: fixed[name] + self.token_noise * std for name, std in self._token_std.items()}
-        joints = perturbed(
-            batch.state[:, :-1], JOINT_NOISE * self.noise
-        )  # the last number is the gripper's, centimetres
+        joints = perturbed(batch.state[:, :-1], JOINT_NOISE * self.noise)  # the last number is the gripper's
         state = torch.cat([joints, batch.state[:, -1:]], 1)
         batch = replace(batch, state=state, view_tokens=perturbed(batch.view_tokens, size["views"]))
         if batch.history is None:
@@ -403,13 +401,10 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
         made.scores.get(memory.storage.scorer) or FrameScores.empty(memory.storage.grid**2),
     )  # fmt: skip
     if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
-        nothing = np.zeros((demonstration.length, policy.embodiment.action.width), np.float32)
-        motion = motion_rows(
-            policy.require_processor(),
-            demonstration.states[: demonstration.length],
-            nothing,
-            np.zeros(demonstration.length, bool),
-        )
+        length = demonstration.length
+        nothing = np.zeros((length, policy.embodiment.action.width), np.float32)
+        states, unknown = demonstration.states[:length], np.zeros(length, bool)
+        motion = motion_rows(policy.require_processor(), states, nothing, unknown)
         history.motion, history.state_width = motion.__getitem__, policy.embodiment.state.width
     return history
 
