@@ -13,6 +13,8 @@ from mme_vla.errors import brief, require
 
 ALL_TASKS = "nano16"
 """The file of configs/nano for a command that names no task."""
+KEYS = {"model": "with_memory", "backbone": "with_backbone", "embodiment": "with_embodiment"}
+"""Words that would choose a file for the whole tree, and the keys of configs/nano.yaml that they set here."""
 
 
 def main() -> None:
@@ -30,14 +32,14 @@ def with_settings(words: Sequence[str]) -> list[str]:
 
     A command that names no task is for all sixteen: `nano=nano16`. `nano=null` does without a file. `model=…` would be
     a choice for a tree that holds one model; here it names the first of several, and leaves out the further models of
-    the task's file. `model=a,b` and `budget=4,16` are lists of one run, which shares demonstrations and has one table.
+    the task's file. `backbone=…` and `embodiment=…` are of all models. `model=a,b` and `budget=4,16` are lists of one run, which shares demonstrations and has one table.
     Other lists of values are sweeps of `--multirun`.
     """
     named = any(word.startswith("model=") for word in words)
     if named and not any(word.startswith("also=") for word in words):
         words = [*words, "also=[]"]
-    words = _as_lists([f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word
-                       for word in words])  # fmt: skip
+    words = _as_lists([f"{KEYS.get(key, key)}{equals}{value}"
+                       for key, equals, value in (word.partition("=") for word in words)])  # fmt: skip
     if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
         return [word for word in words if word != "nano=null"]
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]

@@ -98,7 +98,7 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
     from mme_vla.nano.fitting import compose_policy
     from mme_vla.nano.learning import check_reflection
 
-    words = [f"backbone={config['backbone']}", f"embodiment={config['embodiment']}", "policy.augment=false"]
+    words = [f"backbone={config['with_backbone']}", f"embodiment={config['with_embodiment']}", "policy.augment=false"]
     words += [f"seed={config['seed']}", *config["overrides"]]
     how = (config["memories"], words, extra_dirs, config["plugins"])
     models = list(dict.fromkeys([*as_list(config["with_memory"]), *config["beside"], *config["also"]]))

@@ -253,3 +253,13 @@ def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     wrong = run(app, "--config-dir", "nowhere")
     assert wrong.returncode == 2
     assert "nowhere' does not exist" in wrong.stderr
+
+
+@pytest.mark.parametrize("file", sorted(config_dir().glob("*.yaml")), ids=lambda file: file.stem)
+def test_no_key_of_a_command_has_the_name_of_a_folder_that_it_does_not_choose_from(file: Path) -> None:
+    # Hydra reads such a word of the command line as a choice, and refuses it.
+    tree = OmegaConf.to_container(OmegaConf.load(file))
+    assert isinstance(tree, dict)
+    chosen = {str(key).split("@")[0] for entry in tree["defaults"] if isinstance(entry, dict) for key in entry}
+    folders = {folder.name for folder in config_dir().iterdir() if folder.is_dir()}
+    assert not (set(tree) & folders) - chosen

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from mme_vla import build_policy
+from mme_vla.cli.nano import with_settings
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option
@@ -79,6 +80,11 @@ def test_planned_motions_of_several_tasks_are_one_run() -> None:
     rows = compose_rows(config)
     assert rows.robot.action.answers == "waypoint" and rows.blind == "pi05" and len(config["task"]) == 5
     assert {each["backbone"]["name"] for each in rows.composed.values()} == {"nano"}
+
+
+def test_backbone_and_embodiment_are_chosen_on_the_command_line() -> None:
+    config = compose("nano", with_settings(["embodiment=robomme_waypoint_front_route", "backbone=nano_choice"]))
+    assert (config.with_embodiment, config.with_backbone) == ("robomme_waypoint_front_route", "nano_choice")
 
 
 def test_mirrored_places_of_motions_are_refused_before_anything_is_recorded() -> None:
