@@ -32,8 +32,8 @@ def with_settings(words: Sequence[str]) -> list[str]:
 
     A command that names no task is for all sixteen: `nano=nano16`. `nano=null` does without a file. `model=…` would be
     a choice for a tree that holds one model; here it names the first of several, and leaves out the further models of
-    the task's file. `backbone=…` and `embodiment=…` are of all models. `model=a,b` and `budget=4,16` are lists of one run, which shares demonstrations and has one table.
-    Other lists of values are sweeps of `--multirun`.
+    the task's file. `backbone=…` and `embodiment=…` are those of all models. `model=a,b` and `budget=4,16` are lists of
+    one run, which shares demonstrations and has one table. Other lists of values are sweeps of `--multirun`.
     """
     named = any(word.startswith("model=") for word in words)
     if named and not any(word.startswith("also=") for word in words):
