@@ -182,11 +182,6 @@ class ProcessScore:
     operation: str = ""
     subtask: str = ""
 
-    @property
-    def forgot(self) -> bool:
-        """Whether an operation of memory broke the chain."""
-        return self.operation in OPERATIONS
-
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for records."""
         return asdict(self)

@@ -340,14 +340,3 @@ def _merge(entries: Tensor, times: Tensor) -> BankState:
 
 def _padded(x: Tensor, length: int) -> Tensor:
     return functional.pad(x, (0, 0) * (x.ndim - 1) + (0, length - len(x)))
-
-
-def groups_of(count: int, size: int) -> list[Tensor]:
-    """Places of consecutive groups of `size` moments: each in a bank of its own, whatever episode it is of."""
-    return list(torch.arange(count).split(size))
-
-
-def runs_of(episodes: Tensor) -> list[Tensor]:
-    """Places of consecutive moments of one episode: a bank is emptied when the episode changes."""
-    _, lengths = torch.unique_consecutive(episodes, return_counts=True)
-    return list(torch.arange(len(episodes)).split(lengths.tolist()))

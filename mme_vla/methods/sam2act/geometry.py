@@ -151,11 +151,6 @@ def angles_of_bins(bins: Tensor, count: int) -> Tensor:
     return bins.double() * (360 / count) - 180
 
 
-def from_bins(bins: Tensor, count: int) -> Tensor:
-    """Quaternions [..., 4] (x, y, z, w) of bins [..., 3]."""
-    return quaternions_of(angles_of_bins(bins, count))
-
-
 def _wrap_angle(degrees: Tensor) -> Tensor:
     return 180 - (180 - degrees).remainder(360)
 

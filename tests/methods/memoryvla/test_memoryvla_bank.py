@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of
+from mme_vla.memory.extensions.bank import BankState, MemoryBank
 from mme_vla.methods.memoryvla.action_head import Dit, DitConfig, Schedule
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
 from mme_vla.methods.memoryvla.weights import memoryvla_table
@@ -39,7 +39,7 @@ def test_what_is_stored_carries_no_gradient_and_what_is_read_does() -> None:
     bank = MemoryBank(8, length=4)
     tokens, times = moments(2)
     tokens.requires_grad_()
-    fused, (state,) = bank.run(tokens, times, groups_of(2, 2))
+    fused, (state,) = bank.run(tokens, times, [torch.arange(2)])
     assert not state.entries.requires_grad
     (gradient,) = torch.autograd.grad(fused[1].sum(), tokens)
     assert gradient[0].abs().sum() == 0 and gradient[1].abs().sum() > 0

@@ -11,7 +11,7 @@ from torch import Tensor
 from helpers.baselines import baselines_folder
 from helpers.golden import error
 from helpers.memoryvla_golden import about, arrays, bank, core, golden_name
-from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of, runs_of
+from mme_vla.memory.extensions.bank import BankState, MemoryBank
 from mme_vla.methods.memoryvla.action_head import Schedule
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, cognition_token
 
@@ -124,7 +124,7 @@ def test_memoryvla_groups_of_a_batch_and_their_gradients(
     golden, kind = arrays(folder, "bank"), f"{role}/{case}"
     one = bank(meta["sizes"], role, weights)
     tokens = golden[f"{kind}/tokens"].clone().requires_grad_()
-    fused, _ = one.run(tokens, golden[f"{kind}/times"], groups_of(len(tokens), meta["sizes"]["group_size"]))
+    fused, _ = one.run(tokens, golden[f"{kind}/times"], torch.arange(len(tokens)).split(meta["sizes"]["group_size"]))
     near(fused, golden[f"{kind}/fused"])
     (fused * golden[f"{kind}/cotangent"]).sum().backward()
     assert tokens.grad is not None
@@ -149,12 +149,12 @@ def test_memoryvla_streams_live_across_batches(folder: Path, meta: dict[str, Any
     assert len(batches) > 1
     for name in batches:
         tokens, times, ids = (golden[f"{role}/{name}/{what}"] for what in ("tokens", "times", "ids"))
-        places = runs_of(ids)
+        places = torch.arange(len(ids)).split(torch.unique_consecutive(ids, return_counts=True)[1].tolist())
         fused = []
         for run in places:
             if int(ids[run[0]]) != episode:
                 state = one.init_state(tokens.shape[1])
-            output, (state,) = one.run(tokens[run], times[run], groups_of(len(run), len(run)), [state])
+            output, (state,) = one.run(tokens[run], times[run], [torch.arange(len(run))], [state])
             fused.append(output)
             episode = int(ids[run[0]])
         near(torch.cat(fused), golden[f"{role}/{name}/fused"])
@@ -236,7 +236,7 @@ def test_memoryvla_training_loss_over_two_groups(folder: Path, meta: dict[str, A
     hidden, vision = golden["hidden"].clone().requires_grad_(), golden["vision"].clone().requires_grad_()
     cognition = cognition_token(hidden, meta["sizes"]["patches"], golden["attention_mask"].sum(1))
     draws = {"noise": golden["noise"], "steps": golden["steps"], "drop": golden["drop_draw"]}
-    groups = groups_of(len(hidden), meta["sizes"]["group_size"])
+    groups = torch.arange(len(hidden)).split(meta["sizes"]["group_size"])
     loss = network.loss(cognition, vision, golden["actions"], golden["times"], groups, draws).mean()
     near(loss, golden["loss"])
     loss.backward()
