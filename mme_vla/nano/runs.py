@@ -110,9 +110,9 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
             composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = each
     others = [compose_policy(model, *how) for model in config["drawn_for"] if model not in models]
     robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
-    p, backbones = config["learning"]["reflect"], [each["backbone"] for each in composed.values()]
-    for backbone in backbones if p else []:
-        check_reflection(p, robot.action, backbone["vision"]["layout"])
+    for backbone in (each["backbone"] for each in composed.values()):
+        layout = backbone["vision"]["layout"] if backbone["name"] == "nano" else None
+        check_reflection(config["learning"]["reflect"], robot.action, layout)
     memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
     choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
     blind = [row for row, each in composed.items() if each["memory"] is None and not each["subgoal_text"]]

@@ -90,6 +90,8 @@ def test_backbone_and_embodiment_are_chosen_on_the_command_line() -> None:
 def test_mirrored_places_of_motions_are_refused_before_anything_is_recorded() -> None:
     with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
         compose_rows(resolved(compose("nano", ["nano=motions", "learning.reflect=0.5"])))
+    with pytest.raises(UserError, match=r"backbone=nano_choice"):
+        compose_rows(resolved(compose("nano", ["nano=nano16", "with_backbone=tiny", "overrides=[]"])))
 
 
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
