@@ -110,8 +110,8 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
             composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = each
     others = [compose_policy(model, *how) for model in config["drawn_for"] if model not in models]
     robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
-    for backbone in (each["backbone"] for each in composed.values()):
-        layout = backbone["vision"]["layout"] if backbone["name"] == "nano" else None
+    for vision in (each["backbone"].get("vision") for each in composed.values()):
+        layout = vision.get("layout") if isinstance(vision, Mapping) else None
         check_reflection(config["learning"]["reflect"], robot.action, layout)
     memories = [each["memory"] for each in (*composed.values(), *others) if each["memory"]]
     choices = [FrameChoice(DECISIONS, memory, robot.action.execute) for memory in [None, *memories]]
