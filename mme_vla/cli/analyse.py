@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
-from mme_vla.errors import UserError, check_choice
+from mme_vla.errors import UserError, check_choice, require
 from mme_vla.utils import safe_name
 
 if TYPE_CHECKING:
@@ -179,6 +179,7 @@ def cost(args: argparse.Namespace) -> None:
     for model in models:
         check_choice("model", model, known)
     if args.budgets is not None:
+        require(args.output is None, "--output writes the table of models: leave out --budgets, or --output.")
         success = {int(row["memory_tokens"]): row for row in paper_table("memory_budget")}
         rows = []
         for model in models:
@@ -229,7 +230,10 @@ def writing(args: argparse.Namespace) -> None:
     specs = choose_episodes(args.tasks, number, args.split)
     episodes = [episode for spec in specs if (episode := record_evidence(spec, rendered)) is not None]
     if len(episodes) < len(specs):
-        print(f"{len(specs) - len(episodes)} of {len(specs)} episodes are left out: the demonstrator did not succeed.")
+        print(
+            f"{len(specs) - len(episodes)} of {len(specs)} episodes are left out: their scenes cannot be built, or the "
+            "demonstrator did not succeed."
+        )
     trained = None if policy is None else policy.memory
     results = {
         name: score_writing(selector, episodes, policy if selector is trained else None)
@@ -328,7 +332,8 @@ def _parser() -> argparse.ArgumentParser:
         made.add_argument("--dataset", default="sample", help="LeRobot v3.0 folder (default: %(default)s, built in)")
         made.add_argument("--episodes", type=int, nargs="+", help="which of its episodes (default: all)")
         made.add_argument("--stride", type=int, default=16, help="steps between two chunks (default: %(default)s)")
-        made.add_argument("--most", type=int, help="chunks of an episode at most (default: all)")
+        if run is not recurrence:  # its last chunk has all that it read
+            made.add_argument("--most", type=int, help="chunks of an episode at most (default: all)")
         made.add_argument("--device", default="cpu")
     made = command(selection, "mp4, with a PNG of its last image beside it")
     made.add_argument("--memory", default="tokendrop", help="a memory of configs/memory (default: %(default)s)")

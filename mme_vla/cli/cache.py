@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
-from mme_vla.config.devices import find_device
+from mme_vla.config.devices import own_device
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 
 @cli("cache")
@@ -31,7 +31,7 @@ def main(cfg: DictConfig) -> None:
     policy = build_from_config(cfg, fresh_backbone=init_from is None)
     if init_from is not None:
         print(start_from(policy, init_from))
-    device = _device(cfg.device)
+    device = own_device(cfg.device)
     memory = policy.to(device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
@@ -58,12 +58,3 @@ def main(cfg: DictConfig) -> None:
             batch_size = cfg.data.cache.batch_size
             n_encoded = build_cache(source, memory, encoder.encode_frames, folder, expected, batch_size=batch_size)
         print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")
-
-
-def _device(name: str) -> "torch.device":
-    """`auto` and `cuda` mean this process's own GPU under torchrun."""
-    import torch
-
-    device = find_device(name)
-    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
-    return torch.device("cuda", local_rank) if device.type == "cuda" and device.index is None else device

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
 from mme_vla.config.composition import resolved
-from mme_vla.config.devices import find_device
+from mme_vla.config.devices import own_device
 from mme_vla.errors import check_choice
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     shard = choose_shard(values["shard"])
     environment(settings.env).check_installed()
     log_to_terminal(logger)
-    device = choose_device(str(cfg.device))
+    device = own_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
     prepare_sampling(policy, cfg.sampling, logger)
     sessions = values["recordings"]
@@ -109,16 +109,6 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     report(done, output)
 
 
-def choose_device(name: str) -> "torch.device":
-    """The configured device; under torchrun `auto` gives every process of a machine a GPU of its own."""
-    import torch
-
-    device = find_device(name)
-    if name == "auto" and device.type == "cuda" and "LOCAL_RANK" in os.environ:
-        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
-    return device
-
-
 def choose_subgoals(
     policy: "Policy", section: dict[str, Any] | None, mode: str = "inline", device: "torch.device | None" = None
 ) -> "SubgoalPredictor | None":
@@ -127,8 +117,7 @@ def choose_subgoals(
     section: the section `subgoal` of the configuration. mode: `inline`, or `background`. device: the policy's; a
     predictor with `device: auto` runs there too. None leaves the choice to the predictor.
     """
-    from mme_vla.evaluation.rollout.evaluation import check_subgoals
-    from mme_vla.processing.prompt import subgoal_kind
+    from mme_vla.evaluation.rollout.evaluation import check_subgoals, kind_section
     from mme_vla.subgoal import BackgroundPredictor, build_predictor
 
     check_choice("subgoal_mode", mode, SUBGOAL_MODES)
@@ -136,9 +125,8 @@ def choose_subgoals(
         if policy.require_processor().prompt_spec.reads_subgoal:
             logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
         return None
-    kind = subgoal_kind(policy)
-    if kind is not None and not words_of("subgoal.kind"):
-        section = {**section, "kind": kind.removesuffix("_subgoal")}
+    if not words_of("subgoal.kind"):
+        section = {**section, **kind_section(policy)}
     if device is not None and section.get("device") == "auto":
         section = {**section, "device": str(device)}
     predictor = build_predictor(section)

@@ -7,9 +7,11 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
-from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
+from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
+from mme_vla.config.devices import own_device
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, require
 
 logger = logging.getLogger("mme_vla.probe")
@@ -51,7 +53,7 @@ def probe(cfg: DictConfig) -> None:
     events = event_arms(values["event"])
     require(values["online"] or not events, IN_CLOSED_LOOP)
     settings = RolloutSettings.from_config({**values, "event": None})
-    offline = OfflineSettings.from_config(values)
+    offline = read_section(OfflineSettings, values, others=True)
     jobs = []
     if values["online"] or card:
         jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split, settings.env)
@@ -59,7 +61,7 @@ def probe(cfg: DictConfig) -> None:
     if jobs:
         environment(settings.env).check_installed()
     log_to_terminal(logger)
-    device = choose_device(str(cfg.device))
+    device = own_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
     data = values["recordings"]
     recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))

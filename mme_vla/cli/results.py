@@ -83,6 +83,7 @@ def run(args: argparse.Namespace) -> None:
         tuple(args.tasks or tasks_of(records)), args.episodes or _episodes(records, args.split), args.errors,
         args.confidence, args.samples, args.seed,
     )  # fmt: skip
+    _check_views(args)
     if args.stress:
         curves = stress_curves(records, args.confidence, args.conflicts)
         show_tables([stress_table(curves)], stress_figures(curves), "Episodes that every place of the dial has.", args)
@@ -107,6 +108,17 @@ def run(args: argparse.Namespace) -> None:
         console.print(printable(f"• {note}"), markup=False, highlight=False, soft_wrap=True)
     for path in write(results, comparisons, args):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _check_views(args: argparse.Namespace) -> None:
+    """Refuse two views at once, and options that a view would leave unused."""
+    views = [f"--{name}" for name in ("stress", "events", "ood") if getattr(args, name)]
+    require(len(views) < 2, f"{' and '.join(views)}: name one of them.")
+    unused = [f"--{name}" for name in ("csv", "latex", "compare") if getattr(args, name)]
+    require(
+        not views or not unused,
+        f"{' and '.join(unused)}: not with {''.join(views)}, which writes --markdown and --html.",
+    )
 
 
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
@@ -136,7 +148,9 @@ def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None
     curves = ood.extrapolation(*how)
     tables = [*ood.tier_tables(*how), ood.hard_table(*how), ood.twin_table(*how), ood.extrapolation_table(curves)]
     caption = "All splits of a run together; the training range is shaded."
-    show_tables([table for table in tables if table], ood.extrapolation_figures(curves), caption, args)
+    shown = [table for table in tables if table]
+    require(shown, "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an amount.")
+    show_tables(shown, ood.extrapolation_figures(curves), caption, args)
 
 
 def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace) -> None:

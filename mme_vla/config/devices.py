@@ -5,6 +5,7 @@ cores round what goes into the products of recurrent memories. Nothing else is t
 other than it was.
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -31,6 +32,16 @@ def find_device(name: str) -> "torch.device":
     if device.type == "cuda" and (device.index or 0) >= gpus:
         raise UserError(f"device={name}: PyTorch sees {gpus} GPUs here, counted from 0; use one of them, or cpu.")
     return device
+
+
+def own_device(name: str) -> "torch.device":
+    """The device of that name; `auto` and `cuda` are a GPU of its own for each of a machine's processes (torchrun)."""
+    import torch
+
+    device, rank = find_device(name), int(os.environ.get("LOCAL_RANK", "0"))
+    if device.type != "cuda" or device.index is not None:
+        return device
+    return torch.device("cuda", rank % torch.cuda.device_count())
 
 
 def checked_products(how: str) -> str:

@@ -166,7 +166,7 @@ class EpisodeEnv:
     """
 
     def __init__(
-        self, environment: Environment, env: Any, spec: EpisodeSpec, max_steps: int = 1300, by_choice: bool = False
+        self, environment: Environment, env: Any, spec: EpisodeSpec, max_steps: int, by_choice: bool = False
     ) -> None:
         self.environment, self.env, self.spec = environment, env, spec
         self.max_steps, self._by_choice = max_steps, by_choice
@@ -202,6 +202,11 @@ class EpisodeEnv:
     def render(self) -> Any:
         """What the environment renders."""
         return self.env.render()
+
+    def oracle(self) -> Mapping[str, Any] | None:
+        """The choice that a script takes next; None where the environment has no method `oracle()`, or this says so."""
+        choice: Mapping[str, Any] | None = self.env.oracle() if hasattr(self.env, "oracle") else None
+        return choice
 
     def close(self) -> None:
         """Free the environment."""
@@ -246,9 +251,11 @@ class EpisodeEnv:
             "status": "success" if success and (terminated or truncated) else over,
             "simple_subgoal_online": str(info.get("subgoal", "")),
         }
-        if self._by_choice:
-            choices = dict(self.environment.choices(self.env))
-            require(choices, f"{type(self.environment).__name__} offers no choices to play: implement choices(env).")
+        if self._by_choice and report["status"] == "ongoing":
+            choices, name = dict(self.environment.choices(self.env)), type(self.environment).__name__
+            require(choices, f"{name} offers no choices to play: implement choices(env).")
+            empty = [text for text, actions in choices.items() if not len(actions)]
+            require(not empty, f"{name}.choices(env) has no actions for {empty[:1]}: leave it out, or add one.")
             self._choices = dict(zip(_LETTERS, choices.values(), strict=False))
             options = [Option(letter, text) for letter, text in zip(_LETTERS, choices, strict=False)]
             report["available_multi_choices"] = [option.to_dict() for option in options]

@@ -36,7 +36,7 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         action_space: `joint_angle`, `ee_pose` or `waypoint`.
         reward: `sparse`, `subtask` or `none`.
         images: whether frames are rendered; without, a step is about 80 times faster.
-        max_steps: steps until an episode is truncated.
+        max_steps: steps until an episode is truncated; None: as many as the split allows.
         render_mode: `rgb_array` with images, None without.
     """
 
@@ -50,7 +50,7 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         action_space: str = "joint_angle",
         reward: str = "sparse",
         images: bool = True,
-        max_steps: int = 1300,
+        max_steps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
         check_choice("action_space", action_space, SPACES)

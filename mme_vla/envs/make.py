@@ -175,14 +175,10 @@ class OfficialEnv:
 
     Args:
         env: what the official builder made.
-        max_steps: control steps after which the status becomes `timeout`.
-        include: what observations and infos hold beyond the standard keys.
     """
 
-    def __init__(self, env: Any, max_steps: int, include: Include) -> None:
+    def __init__(self, env: Any) -> None:
         self._env: Any = env
-        self.max_steps = max_steps
-        self.include = include
         self._newest: np.ndarray | None = None
         self._started = False
 
@@ -227,7 +223,7 @@ def make_official_env(
     task: str, split: str, episode: int, action_space: str, max_steps: int, options: dict[str, Any]
 ) -> OfficialEnv:
     """Make an episode of the official package."""
-    include = Include.from_options(options)
+    Include.from_options(options)  # refuses those that are unknown
     require(
         find_spec("robomme") is not None,
         "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
@@ -245,8 +241,8 @@ def make_official_env(
     count = builder.get_episode_num()
     exists = 0 <= episode < count
     require(exists, f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
-    flags = {name: True for name, yes in include.options.items() if yes}
-    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags), max_steps, include)
+    flags = {name: True for name, yes in options.items() if yes}
+    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags))
 
 
 def _flat(info: dict[str, Any]) -> dict[str, Any]:

@@ -76,11 +76,6 @@ class Include:
             require(isinstance(value, bool), f"{name} is {value!r}; expected True or False.")
         return cls(**{name.removeprefix("include_"): value for name, value in options.items()})
 
-    @property
-    def options(self) -> dict[str, bool]:
-        """The keyword arguments that say the same."""
-        return {f"include_{field.name}": getattr(self, field.name) for field in fields(self)}
-
 
 class AngleTrack:
     """Roll, pitch and yaw that continue where the previous frame's left off instead of jumping by a full turn.

@@ -16,11 +16,12 @@ from mme_vla.evaluation.rollout.evaluation import (
     default_output,
     evaluate_events,
     facts_of,
+    predictor_of,
 )
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
-from mme_vla.subgoal import SubgoalPredictor, build_predictor
+from mme_vla.subgoal import SubgoalPredictor
 
 
 def evaluate(
@@ -70,7 +71,7 @@ def evaluate(
     if base is make_env:
         environment(run_settings.env).check_installed()
     loaded, source = load(policy)
-    predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
+    predictor = predictor_of(loaded, subgoal)
     subgoal_label = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
     facts = facts_of(loaded, name, source, run_settings, subgoal_label)
     folder = default_output(facts) if output is None else Path(output).expanduser()

@@ -18,7 +18,7 @@ from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import VIDEOS, choose_shard, evaluate, facts_of
+from mme_vla.evaluation.rollout.evaluation import VIDEOS, choose_shard, evaluate, facts_of, predictor_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.nano.demonstrations import Demonstration
@@ -32,7 +32,6 @@ from mme_vla.probing.channels import channel_of
 from mme_vla.probing.probed import ProbedPolicy
 from mme_vla.probing.run import named
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.subgoal import build_predictor
 from mme_vla.utils import read_json, write_json
 
 PLANNER, DEMONSTRATOR, RANDOM, FREQUENT = "planner", "demonstrator", "random", "frequent"
@@ -214,8 +213,7 @@ def run_episodes(
     oracle: the memory chooses among the frames at which a sub-task began, as the probe's arm of this name.
     """
     policy: Policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
-    kind = subgoal_kind(policy)
-    subgoals = None if kind is None else build_predictor({"name": ORACLE, "kind": kind.removesuffix("_subgoal")})
+    subgoals = predictor_of(policy, None if subgoal_kind(policy) is None else ORACLE)
     settings = RolloutSettings.from_config({
         "seed": rules.seed, "split": rules.split, "max_steps": rules.steps, "workers": rules.workers,
         "max_actions": rules.max_choices, "only_possible": rules.only_possible, "video": video,

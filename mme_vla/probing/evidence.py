@@ -42,11 +42,12 @@ class EvidenceEpisode:
 
 
 def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -> EvidenceEpisode | None:
-    """Demonstrate an episode of a split; None where the demonstrator does not succeed.
+    """Demonstrate an episode of a split; None where the scene cannot be built or the demonstrator does not succeed.
 
     rendered: frames whose image is wanted. Without any an episode takes about a second.
     """
     from mme_vla.envs.recording.recorder import Recorder
+    from mme_vla.envs.scene.placement import SceneError
 
     render = rendered != frozenset()
     env = make_task(spec.task, render=render, **spec.options)
@@ -76,6 +77,8 @@ def record_evidence(spec: EpisodeSpec, rendered: Container[int] = frozenset()) -
     try:
         request = RenderRequest({"front": rendered}, now=(), grounded=False)
         result = Recorder(env, render, on_step=take, render_request=request).record()
+    except SceneError:
+        return None
     finally:
         env.close()
     if not result.success:

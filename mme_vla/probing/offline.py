@@ -1,16 +1,15 @@
 """A probe on recorded episodes: how the chunk that a policy would choose changes with what it remembers."""
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.config.sections import NonNegativeInt, PositiveInt, read_section
+from mme_vla.config.sections import NonNegativeInt, PositiveInt
 from mme_vla.evaluation.feed import Feed
 from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.rollout.episode import episode_seed
@@ -22,6 +21,7 @@ from mme_vla.probing.lines import EntryLine, Line, MomentLine
 from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy, others
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.types import Noise
+from mme_vla.utils import FolderLock
 
 
 @dataclass(frozen=True)
@@ -69,11 +69,6 @@ class OfflineSettings:
     scan: bool = True
     flow_steps: int | None = None
 
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Read the keys of a configuration that are settings; others are ignored."""
-        return read_section(cls, config, others=True)
-
 
 def probe_offline(
     policy: Policy,
@@ -89,14 +84,15 @@ def probe_offline(
     recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines. after: called
     after each episode with 1.
     """
-    _, done = lines.read(path)
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
-    for recording in recordings:
-        if recording.name not in done:
-            result = _Moments(policy, arms, recording, lend, donors, settings).lines()
-            lines.append(path, result, recording.name)
-        after(1)
-    return lines.read(path)[0]
+    with FolderLock(path.parent, "probe", f".{path.stem}.lock"):
+        _, done = lines.read(path)
+        for recording in recordings:
+            if recording.name not in done:
+                result = _Moments(policy, arms, recording, lend, donors, settings).lines()
+                lines.append(path, result, recording.name)
+            after(1)
+        return lines.read(path)[0]
 
 
 class _Moments:

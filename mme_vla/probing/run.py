@@ -20,7 +20,14 @@ from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.events import idle_events
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.evaluation import Shard, choose_episodes, evaluate, evaluate_events, facts_of
+from mme_vla.evaluation.rollout.evaluation import (
+    Shard,
+    choose_episodes,
+    evaluate,
+    evaluate_events,
+    facts_of,
+    predictor_of,
+)
 from mme_vla.evaluation.rollout.events import event_arms
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -32,7 +39,7 @@ from mme_vla.probing.channels import channel_of
 from mme_vla.probing.offline import OfflineSettings, probe_offline
 from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.probing.report import Findings, write_images, write_page
-from mme_vla.subgoal import SubgoalPredictor, build_predictor
+from mme_vla.subgoal import SubgoalPredictor
 
 OFFLINE, ONLINE = "offline", "online"  # Folders of the lines and of the closed loop
 NO_DATA = (
@@ -199,7 +206,7 @@ def probe(
     jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split, run_settings.env)
     if jobs and base is make_env:
         environment(run_settings.env).check_installed()
-    predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
+    predictor = predictor_of(loaded, subgoal)
     facts = facts_of(loaded, name, source, run_settings, subgoal if isinstance(subgoal, str) else None)
     offline = read_section(OfflineSettings, {"seed": seed, "draws": draws, "moments": moments})
     plan = ProbePlan(arms, recorded, recorded, jobs, offline, source=source, events=arms_of_events)

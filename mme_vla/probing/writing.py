@@ -21,8 +21,8 @@ from mme_vla.processing.normalise import normalize
 if TYPE_CHECKING:
     from mme_vla.policy.mme import MMEPolicy
 
-LONGEST = 2000
-"""Frames of an episode at most: a demonstration that takes longer is given up."""
+LONGEST = 4000
+"""Frames of an episode that are rendered for a memory at most."""
 STRIDE = 4
 """Frames between two steps at which a memory selects: the resolution of the lag."""
 FRAMES = 32
@@ -251,6 +251,8 @@ def score_writing(
         UserError: the memory keeps no frames, or reads tokens and there is no policy.
     """
     writing = Writing()
+    if not episodes:
+        return writing
     raw = np.concatenate([episode.states for episode in episodes])
     if policy is None:
         normalised = normalised_states(raw)
@@ -270,8 +272,11 @@ def score_writing(
 
 
 def writing_table(results: Mapping[str, Writing]) -> str:
-    """Two Markdown tables: the means of each memory, and the score of each in every task with chance behind it."""
-    rows = {name: writing.to_dict() for name, writing in results.items()}
+    """Two Markdown tables: the means of each memory, and the score of each in every task with chance behind it.
+
+    Memories that were scored on no episode are left out.
+    """
+    rows = {name: writing.to_dict() for name, writing in results.items() if writing.tasks}
     lines = ["| memory | score | chance | precision | recall | lag | held |", "|---|---:|---:|---:|---:|---:|---:|"]
     for name, row in rows.items():
         mean = row["mean"]

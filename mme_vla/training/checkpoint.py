@@ -208,10 +208,10 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
 def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = False) -> None:
     """Refuse to begin a run whose first checkpoints would not fit on the disk.
 
-    A sharded run's hold the weights twice: the trained ones in parts, and the averages whole.
+    They are stored in float32. A sharded run's hold the weights twice: the trained ones in parts, the averages whole.
     """
-    weights = sum(p.numel() * p.element_size() for p in policy.parameters())
-    trained = sum(p.numel() * p.element_size() for p in trainable(policy).values())
+    weights = sum(4 * p.numel() for p in policy.parameters())
+    trained = sum(4 * p.numel() for p in trainable(policy).values())
     needed = (weights * (1 + sharded) + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free

@@ -22,7 +22,6 @@ def record_own(
     output: Path,
     work: Path,
     fps: int = 20,
-    max_steps: int = 1300,
 ) -> tuple[int, list[EpisodeSpec]]:
     """Demonstrate episodes into a new dataset; those that do not succeed are left out.
 
@@ -42,7 +41,7 @@ def record_own(
     with quiet_libraries(), progress("record", len(specs), unit="episodes") as advance:
         for path, spec in episodes.items():
             if not path.is_file():
-                columns = _demonstrated(environment, spec, max_steps)
+                columns = _demonstrated(environment, spec)
                 if columns is None:
                     failures.append(spec)
                 else:
@@ -66,9 +65,9 @@ def record_own(
     return frames, failures
 
 
-def _demonstrated(environment: Environment, spec: EpisodeSpec, max_steps: int) -> dict[str, np.ndarray] | None:
+def _demonstrated(environment: Environment, spec: EpisodeSpec) -> dict[str, np.ndarray] | None:
     """The columns of an episode [frames, …] and its `task`; None where it did not succeed."""
-    env = EpisodeEnv(environment, environment.make(spec), spec, max_steps)
+    env = EpisodeEnv(environment, environment.make(spec), spec, environment.step_limit(spec.split))
     try:
         rows = []
         for observation, action, visible in env.demonstration():

@@ -12,6 +12,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.statistics import compute_norm_stats, normalised_states
 from mme_vla.errors import UserError, require
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.memory.base import Memory, make_scorer
 from mme_vla.memory.history import OnlineHistory
@@ -34,6 +35,8 @@ def replay(
 ) -> Iterator[tuple[int, Episode]]:
     """Show a recorded episode frame by frame and let the policy act at every `stride`-th execution step.
 
+    A robot whose actions are motions acts wherever it decides.
+
     The recorded actions are executed, not the policy's. Subgoals, where the policy reads them,
     are the recorded ones.
 
@@ -44,21 +47,11 @@ def replay(
     """
     check_episode(source, episode)
     give_statistics(policy, source)
-    start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
-    steps = np.arange(start, length, stride)
-    if most is not None and most < len(steps):
-        steps = steps[np.linspace(0, len(steps) - 1, most).round().astype(int)]
+    recording, n_observed = Recording(source, episode), 0
     text = SubgoalText.from_config(policy.config.get("subgoal_text"))
-    running, n_observed = policy.start_episode(source.goal(episode)), 0
-    running.options = source.options(episode)
-    for step in steps.tolist():
-        indices = np.arange(n_observed, step + 1)
-        views = {view: source.frames(episode, indices, view) for view in policy.embodiment.camera_names}
-        executed = indices[indices >= start]
-        actions = source.actions(episode)[np.maximum(executed - 1, 0)]
-        if source.robot.action.frames is None:
-            actions = source.past_actions(episode, step, len(actions))
-        running.observe(views, source.states(episode, n_observed, step + 1), indices < start, actions)
+    running = policy.start_episode(recording.goal)
+    for step in recording.decisions(stride, most):
+        recording.show(running, n_observed, step + 1)
         n_observed = step + 1
         if text is not None:
             texts = source.subgoals(episode, step)

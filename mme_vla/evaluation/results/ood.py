@@ -14,8 +14,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.metadata import BASE, HARD, TWIN, read_variant
 from mme_vla.envs.rows import OOD, TIERS
-from mme_vla.errors import UserError
-from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, by_run, merge
 from mme_vla.evaluation.results.aggregate import Interval, repeated_episodes, wilson
 from mme_vla.evaluation.results.curves import curve_figure
 from mme_vla.evaluation.results.paper import paper_table
@@ -82,7 +81,7 @@ def tier_tables(records: Sequence[EpisodeRecord], confidence: float = 0.95, conf
     published = paper_table("ood")
     columns = ["task", *TIERS, "all", "%", f"{100 * confidence:g} %", *(row["method"] for row in published)]
     tables = []
-    for run, members in _by_run(merged).items():
+    for run, members in by_run(merged).items():
         rows = []
         for task in (*(t for t in PAPER_ORDER if any(r.task == t for r in members)), "all"):
             mine = [r for r in members if task in ("all", r.task)]
@@ -107,7 +106,7 @@ def hard_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
     if not merged:
         return None
     rows = []
-    for run, members in _by_run(merged).items():
+    for run, members in by_run(merged).items():
         share = Share.of(members, confidence)
         rows.append([str(run), str(share), f"{share.rate:.1f}", share.span])
     for row in paper_table("hard"):
@@ -117,7 +116,7 @@ def hard_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
             [f"{row['method']}, published", f"{', '.join(map(str, won))} of {row['episodes']}", f"{rate:.1f}", ""]
         )
     columns = ["run", "successes", "%", f"{100 * confidence:g} %"]
-    return Table(f"Hard test episodes; published: {SOURCE}", columns, rows, {len(_by_run(merged))})
+    return Table(f"Hard test episodes; published: {SOURCE}", columns, rows, {len(by_run(merged))})
 
 
 def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Table | None:
@@ -128,7 +127,7 @@ def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
     """
     merged = merge(records, conflicts)
     repeats = repeated_episodes(records)
-    runs = _by_run(merged)
+    runs = by_run(merged)
     rows = []
     for run, members in runs.items():
         twin = run._replace(split=TWIN if run.split == BASE else f"{TWIN}:{run.split}")
@@ -156,27 +155,29 @@ def _common(
     return [(record, others[record.key]) for record in first if record.key in others]
 
 
-def _by_run(records: Sequence[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:
-    runs: dict[RunKey, list[EpisodeRecord]] = {}
-    for record in records:
-        runs.setdefault(record.run, []).append(record)
-    return runs
-
-
 # Extrapolation ----------------------------------------------------------------------------------------------------
 
 
 @cache
-def amount_of(task: str, split: str, key: EpisodeKey) -> int:
-    """How often, how many or how long an episode is, by `AMOUNTS`; scenes without a row are built for that."""
+def amount_of(task: str, split: str, key: EpisodeKey) -> int | None:
+    """How often, how many or how long an episode is, by `AMOUNTS`; scenes without a row are built for that.
+
+    None where the scene cannot be built.
+    """
+    from mme_vla.envs.scene.placement import SceneError
+
     spec = metadata.episode(task, split, key.episode)
     values: dict[str, Any] = dict(spec.row["spec"]) if spec.row is not None else {}
     if not values:
         require_simulator()
         env = make_task(task, render=False, **spec.options)
-        env.reset()
-        values = env.scene_values()["spec"]
-        env.close()
+        try:
+            env.reset()
+            values = env.scene_values()["spec"]
+        except SceneError:
+            return None
+        finally:
+            env.close()
     _, name, _ = AMOUNTS[task]
     part, value = name.split(".")
     amount = values[part][value]
@@ -194,7 +195,7 @@ def extrapolation(
 ) -> Extrapolation:
     """Success against the amount of what grows, over all splits of a model: training, test, stress and OOD.
 
-    Twins and splits with sessions are left out.
+    Twins, splits with sessions and scenes that cannot be built are left out.
     """
     groups: dict[tuple[str, str], dict[int, list[EpisodeRecord]]] = {}
     for record in merge(records, conflicts):
@@ -202,18 +203,18 @@ def extrapolation(
         if record.task not in AMOUNTS or (variant is not None and (variant.twin or variant.sessions)):
             continue
         amount = amount_of(record.task, record.split, record.key)
+        if amount is None:
+            continue
         at = str(record.run._replace(split=BASE)), record.task
         groups.setdefault(at, {}).setdefault(amount, []).append(record)
-    if not groups:
-        raise UserError("None of these records is of a task with a count, swaps, picks or a path.")
     return {
         at: {amount: Share.of(members, confidence) for amount, members in sorted(by_amount.items())}
         for at, by_amount in groups.items()
     }
 
 
-def extrapolation_table(curves: Extrapolation) -> Table:
-    """Every point, a row each; amounts beyond the training range are marked."""
+def extrapolation_table(curves: Extrapolation) -> Table | None:
+    """Every point, a row each; amounts beyond the training range are marked. None without a point."""
     rows = []
     for (run, task), points in sorted(curves.items()):
         kind, _, (least, most) = AMOUNTS[task]
@@ -221,7 +222,7 @@ def extrapolation_table(curves: Extrapolation) -> Table:
             trained = "trained" if least <= amount <= most else "beyond"
             rows.append([run, task, kind, str(amount), trained, str(share), f"{share.rate:.1f}", share.span])
     columns = ["run", "task", "what grows", "amount", "training range", "successes", "success (%)", "interval"]
-    return Table("Extrapolation", columns, rows)
+    return Table("Extrapolation", columns, rows) if rows else None
 
 
 def extrapolation_figures(curves: Extrapolation) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from mme_vla.envs.base import environment
 from mme_vla.envs.episodes import choose_episodes as choose_specs
-from mme_vla.envs.make import check_sessions, make_env
+from mme_vla.envs.make import ROBOMME, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError, require
 from mme_vla.evaluation.receipts import receipt
@@ -26,7 +26,7 @@ from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDist
 from mme_vla.policy.saving import composition_digest
 from mme_vla.policy.training_identity import identity_of
 from mme_vla.processing.prompt import subgoal_kind
-from mme_vla.subgoal import SubgoalPredictor
+from mme_vla.subgoal import SubgoalPredictor, build_predictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.utils import remove_drafts, safe_name
 
@@ -172,7 +172,7 @@ def evaluate(
             workload = Workload()
             if envs is not None:
                 folder = output / SUBGOALS if settings.subgoal_log else None
-                renders = base is make_env and settings.render
+                renders = base is make_env and settings.env in ROBOMME and settings.render
                 with envs, receipt(output / shard.file, policy, run, source, renders):
                     rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress, workload)
                     rollout.run(waiting)
@@ -250,6 +250,17 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
     if kind is not None and kind != f"{subgoals.kind}_subgoal":
         expected = kind.removesuffix("_subgoal")
         raise UserError(f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}.")
+
+
+def kind_section(policy: Policy) -> dict[str, str]:
+    """The key `kind` of a predictor's section: what the policy was trained to read. Empty where it does not say."""
+    kind = subgoal_kind(policy)
+    return {} if kind is None else {"kind": kind.removesuffix("_subgoal")}
+
+
+def predictor_of(policy: Policy, subgoal: str | SubgoalPredictor | None) -> SubgoalPredictor | None:
+    """A predictor by its name, of the kind of subgoals that the policy reads; one that is given stays as it is."""
+    return build_predictor({"name": subgoal, **kind_section(policy)}) if isinstance(subgoal, str) else subgoal
 
 
 def checkpoint_label(source: str | None) -> int | str:

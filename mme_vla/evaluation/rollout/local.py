@@ -1,6 +1,6 @@
 """Environments of a rollout without worker processes."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from mme_vla.envs.vector.pool import Job, Reply
@@ -27,18 +27,18 @@ class LocalEnvs:
         """Begin an episode."""
         self._close()
         self._job = job
-        try:
+
+        def begin() -> Any:
             self._env = make_rollout_env(job.task, job.split, job.episode, **self._options)
-            self._add(Reply.of_outcome(worker, job, True, self._env.reset(**how)))
-        except UserError:
-            raise
-        except Exception as error:  # a scene that cannot be built ends its episode, not the others
-            self._add(Reply.of_failure(worker, job, True, type(error).__name__, str(error)))
+            return self._env.reset(**how)
+
+        self._run(worker, True, begin)
 
     def send(self, worker: int, action: Any) -> None:
         """Execute a chunk."""
-        assert self._env is not None
-        self._add(Reply.of_outcome(worker, self._job, False, self._env.step(action)))
+        env = self._env
+        assert env is not None
+        self._run(worker, False, lambda: env.step(action))
 
     def recv(self, timeout: float | None = None) -> list[Reply]:
         """The reply that is waiting."""
@@ -50,6 +50,16 @@ class LocalEnvs:
 
     def __exit__(self, *_: object) -> None:
         self._close()
+
+    def _run(self, worker: int, first: bool, act: Callable[[], Any]) -> None:
+        """Add the reply of a reset or a step; an error ends its episode, not the others."""
+        try:
+            reply = Reply.of_outcome(worker, self._job, first, act())
+        except UserError:
+            raise
+        except Exception as error:
+            reply = Reply.of_failure(worker, self._job, first, type(error).__name__, str(error))
+        self._add(reply)
 
     def _add(self, reply: Reply) -> None:
         if reply.done:
