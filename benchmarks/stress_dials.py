@@ -9,7 +9,6 @@ outside, as a policy in an evaluation does, by choices and pixels, and has so ma
 import argparse
 import csv
 from collections.abc import Callable
-from dataclasses import astuple
 from pathlib import Path
 
 from mme_vla.envs import metadata
@@ -18,7 +17,7 @@ from mme_vla.envs.metadata import DIALS
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
 from mme_vla.play import OraclePlayer
-from mme_vla.play.game import MAX_CHOICES, EpisodeId
+from mme_vla.play.game import MAX_CHOICES
 from mme_vla.play.players import play
 from mme_vla.play.run import make_session
 
@@ -49,8 +48,7 @@ def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
 def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
     """The oracle planner's choices in the environment that policies meet, without images."""
     spec = metadata.episode(task, f"stress:{dial}={value}", episode)
-    which = EpisodeId(*astuple(spec))
-    session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, images=False)
+    session = make_session(spec, "mme_vla", MAX_STEPS, MAX_CHOICES, images=False)
     try:
         play(session, OraclePlayer())
         video = len(session.reveals[0].frames) - 1

@@ -42,7 +42,8 @@ def add(folder: Path) -> None:
         target.mkdir(parents=True, exist_ok=True)
         for name in FILES:
             shutil.copyfile(place / name, target / name)
-        lines = b"".join(path.read_bytes() for path in sorted(place.glob("episodes*.jsonl")))
+        files = sorted(place.glob("episodes*.jsonl*"))
+        lines = b"".join(lzma.decompress(f.read_bytes()) if f.suffix == ".xz" else f.read_bytes() for f in files)
         (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
         if (receipt := place / "receipt.json").is_file():
             copy_receipt(receipt, target / receipt.name)

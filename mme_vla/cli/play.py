@@ -13,12 +13,13 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.config.composition import resolved
 from mme_vla.config.sections import PositiveInt, read_section
 from mme_vla.envs.base import environment
-from mme_vla.envs.episodes import named_tasks
+from mme_vla.envs.episodes import choose_episodes, named_tasks
+from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.store import INDIFFERENT
-from mme_vla.play.game import ChoiceSession, EpisodeId
-from mme_vla.play.run import Identity, PlayRun, choose_episodes, make_session
+from mme_vla.play.game import ChoiceSession
+from mme_vla.play.run import Identity, PlayRun, make_session
 
 log = logging.getLogger("mme_vla.play")
 HUMAN = "human"
@@ -85,7 +86,7 @@ def _by_itself(run: PlayRun, player: Any) -> None:
         log.info("%d/%d %s", number, len(todo), line(_play_one(run, which, player)))
 
 
-def _play_one(run: PlayRun, which: EpisodeId, player: Any) -> EpisodeRecord:
+def _play_one(run: PlayRun, which: EpisodeSpec, player: Any) -> EpisodeRecord:
     """Play and record one episode; what breaks in it ends it with an error, but not the run."""
     from mme_vla.play.players import play
 

@@ -23,14 +23,14 @@ logger = logging.getLogger("mme_vla.serving")
 def main(cfg: DictConfig) -> None:
     """Serve `checkpoint`, or a fresh `model`, until SIGTERM or Ctrl-C."""
     from mme_vla.serving.server import PolicyServer
-    from mme_vla.serving.settings import ServeSettings
+    from mme_vla.serving.settings import ServeSettings, is_local
 
     settings = ServeSettings.from_dict(resolved(cfg))
     log_to_terminal(logger, clock=True)
     policy, name, _ = load_policy(cfg, "serve", logger)
     prepare_sampling(policy, cfg.sampling, logger)
     server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
-    if not settings.local_only and settings.api_key is None:
+    if not is_local(settings.host) and settings.api_key is None:
         logger.warning("host=%s without api_key: every client that reaches this port can use it", settings.host)
     if server.metadata["subgoal"] is not None:
         logger.info("reads the key %r of each request; without it, the goal alone", server.metadata["subgoal"])

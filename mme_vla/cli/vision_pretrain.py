@@ -1,7 +1,7 @@
 """`mme-vla vision-pretrain`: the vision tower of the nano backbone, from renders of the tasks."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +9,10 @@ from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.config.composition import compose, resolved
+from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, require
 
 logger = logging.getLogger("mme_vla.nano")
-LEVELS = ("easy", "medium", "hard")
 
 
 @cli("vision_pretrain")
@@ -26,9 +26,11 @@ def main(cfg: DictConfig) -> None:
 
 
 def run(config: Mapping[str, Any]) -> Path:
-    """Both stages; the path of the weights."""
+    """Both stages; the path of the weights. A folder with other settings is refused."""
     from mme_vla.backbone.tower import TowerConfig
     from mme_vla.config.sections import read_section
+    from mme_vla.envs.episodes import choose_tasks
+    from mme_vla.evaluation.store import claim_run
     from mme_vla.nano.pretraining import PretrainSettings, fresh_tower, pretrain
 
     require(
@@ -36,26 +38,29 @@ def run(config: Mapping[str, Any]) -> Path:
         f"held_out={config['held_out']}: must be less than scenes={config['scenes']}, which it is a part of.",
     )
     sizes = read_section(TowerConfig, resolved(compose("policy", ["backbone=nano"]).backbone.vision), "backbone.vision")
-    files, held_out = _record(config, sizes.image_size)
-    names = ("steps", "batch_size", "lr", "save_every", "seed")
-    settings = PretrainSettings(**{name: config[name] for name in names})
-    return pretrain(fresh_tower(sizes, settings.seed), files, held_out, Path(config["output"]), settings)
+    tasks, folder = choose_tasks(config["tasks"]), Path(config["output"])
+    of_tower = {name: config[name] for name in ("steps", "batch_size", "lr", "seed")}
+    of_scenes = {name: config[name] for name in ("scenes", "held_out", "arrangements", "first_seed")}
+    claim_run(folder, {"tasks": tasks, **of_scenes, **of_tower})
+    files, held_out = _record(config, tasks, sizes.image_size)
+    settings = PretrainSettings(**of_tower, save_every=config["save_every"])
+    return pretrain(fresh_tower(sizes, settings.seed), files, held_out, folder, settings)
 
 
-def _record(config: Mapping[str, Any], size: int) -> tuple[list[Path], list[Path]]:
+def _record(config: Mapping[str, Any], tasks: Sequence[str], size: int) -> tuple[list[Path], list[Path]]:
     """Render what is missing; the files of the scenes to learn from, and of those held out: the last of each task."""
     from mme_vla.data.console import progress
-    from mme_vla.envs.episodes import choose_tasks
     from mme_vla.envs.recording.processes import carry_out
 
-    folder, first, tasks = Path(config["output"]) / "scenes", config["first_seed"], choose_tasks(config["tasks"])
+    folder, first = Path(config["output"]) / "scenes", config["first_seed"]
     learned: list[Path] = []
     held_out: list[Path] = []
     jobs = []
     for number in range(config["scenes"]):
         measures = number >= config["scenes"] - config["held_out"]
         arrangements = 0 if measures else config["arrangements"]
-        jobs += [(folder, task, first + number, LEVELS[number % len(LEVELS)], arrangements, size) for task in tasks]
+        level = DIFFICULTIES[number % len(DIFFICULTIES)]
+        jobs += [(folder, task, first + number, level, arrangements, size) for task in tasks]
     with progress("scenes", len(jobs)) as advance:
         for seed, file, error in carry_out(jobs, _recorded, config["workers"]):
             if file is None:

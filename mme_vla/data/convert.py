@@ -19,7 +19,7 @@ import numpy as np
 from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.data.hdf5 import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame, open_episode, recorded_options
 from mme_vla.data.keyframes import file_of, write_keyframes
-from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
+from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX, SIDE_FILE
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError, did_you_mean, require
@@ -84,7 +84,6 @@ def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Pat
     return sheet, video
 
 
-SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
 _PARTS, _MERGED, _KEYFRAMES = "episodes", "merged", "keyframes.npz"
 
 

@@ -185,11 +185,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         short = self.processor.embodiment.action.horizon - 1 if self.processor.samples.full_chunks_only else 0
         return decisions[: max(len(decisions) - short, 0)]
 
-    @property
-    def total_frames(self) -> int:
-        """Frames of the chosen episodes, conditioning videos included."""
-        return int(sum(self.sources[s].lengths[e] for s, e in zip(self._source, self._episode, strict=True)))
-
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch, which the random part of items depends on."""
         self.epoch = epoch

@@ -19,6 +19,7 @@ from mme_vla.data.lerobot_files import (
     REMEDY,
     RENDERED_SUFFIX,
     SAMPLE,
+    SIDE_FILE,
     check_vectors,
     content_fingerprint,
     find_columns,
@@ -39,7 +40,6 @@ from mme_vla.embodiment.action_space import read_options
 from mme_vla.errors import UserError, brief, did_you_mean, require
 from mme_vla.utils import Sums, decoding, read_json
 
-SIDE_FILE = "meta/robomme_episodes.json"
 log = logging.getLogger(__name__)
 
 

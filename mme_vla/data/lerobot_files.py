@@ -20,6 +20,8 @@ from mme_vla.embodiment.action_space import POSE_WIDTH
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.utils import decoding, inside, read_json, require_file
 
+SIDE_FILE = "meta/robomme_episodes.json"
+"""What LeRobot's columns have no place for: task, seed, difficulty, options of a choice."""
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
 RENDERED_SUFFIX = "_drawn"
 """After a camera's name: the column that says which frames it was rendered at, where not at all."""

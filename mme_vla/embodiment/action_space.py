@@ -111,6 +111,7 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
     require(
         len({option.label for option in options}) >= len(options), f"The options {brief(value)} have a letter twice."
     )
+    require(any(option.possible for option in options), f"None of the options {brief(value)} is possible.")
     return tuple(options)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
 from mme_vla.envs.observations import Include
+from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import check_known, missing_extra, require
 from mme_vla.registry import TASKS
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 ROBOMME = ("mme_vla", "official")
 """Environments that are RoboMME."""
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
-_DIFFICULTIES = ("easy", "medium", "hard")
 
 
 def make_env(
@@ -124,7 +124,7 @@ def check_names(task: str, action_space: str, difficulty: str | None, seed: int 
     check_task_name(task)
     check_known("action space", action_space, ACTION_SPACES)
     if difficulty is not None:
-        check_known("difficulty", difficulty, _DIFFICULTIES)
+        check_known("difficulty", difficulty, DIFFICULTIES)
         require(seed is not None, "A difficulty needs a seed: an episode of a split has its own.")
 
 

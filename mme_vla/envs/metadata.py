@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mme_vla.envs.rows import OOD, check_row, is_row_split, rows_of, task_options
+from mme_vla.envs.rows import DIFFICULTIES, OOD, check_row, is_row_split, rows_of, task_options
 from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.registry import TASKS
 from mme_vla.utils import read_json
@@ -124,7 +124,7 @@ MORE = "more"
 FURTHER, FURTHER_EPISODES = "further", 100
 """Episodes that continue where the test split's rule ends, for tests on new scenes; no split either."""
 _CYCLE = ("easy", "easy", "medium", "hard")
-FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
+FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in DIFFICULTIES}
 """Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
 RESERVED = "reserved"
 """Episodes for one final test of what was chosen on others; no split of the benchmark."""

@@ -19,13 +19,13 @@ from mme_vla.errors import UserError, brief, did_you_mean
 Row = dict[str, Any]
 OOD = "ood"
 """The split of RoboMME-OOD; `ood:xhard3` has the episodes of one tier."""
+DIFFICULTIES = ("easy", "medium", "hard")
 TIERS = tuple(f"xhard{i}" for i in range(1, 6))
 SUFFIX = ".jsonl"
 _TIER = re.compile(rf"{OOD}(?::(.+))?")
-_LEVELS = ("easy", "medium", "hard")
 _PARTS = ("layout", "objects", "actions", "initializations")
 _OPTIONAL: dict[str, tuple[Any, ...]] = {
-    "difficulty": _LEVELS, "recovery": ("z", "xy", None), "in_view": (True, False),
+    "difficulty": DIFFICULTIES, "recovery": ("z", "xy", None), "in_view": (True, False),
 }  # fmt: skip
 
 
@@ -66,7 +66,7 @@ def _ood() -> dict[str, list[Row]]:
 def _read_file(path: str, modified: int, known: tuple[str, ...]) -> dict[str, list[Row]]:
     """Rows by task. modified: time of the last change, so that a changed file is read again."""
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = Path(path).read_text(encoding="utf-8").split("\n")  # values may hold other separators
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read as text: {error}.") from error
     numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]

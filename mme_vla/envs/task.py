@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.envs.scene.motions import Cue, build_cue, show_cue
 from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.stage import Stage
@@ -16,7 +17,6 @@ from mme_vla.envs.scene.values import Values
 from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import check_known, require
 
-DIFFICULTIES = ("easy", "medium", "hard")
 RECOVERY_MODES = ("z", "xy")
 
 

@@ -122,7 +122,8 @@ class Board:
         """Make the figures. rows: as `read_rows` gives them."""
         require(rows, "There are no rows: train one with model=…, or name folders with rows=….")
         scenes = next(iter(rows.values()))[0].scenes
-        tasks = sorted({key.task for key in scenes}, key=PAPER_ORDER.index)
+        names = dict.fromkeys(key.task for key in scenes)
+        tasks = [*(task for task in PAPER_ORDER if task in names), *(task for task in names if task not in PAPER_ORDER)]
         counts = {sum(key.task == task for key in scenes) for task in tasks}
         require(len(counts) == 1, f"Tasks have {sorted(counts)} scenes: a board has as many of each task.")
         self.protocol = Protocol(tuple(tasks), counts.pop(), samples=samples)
@@ -210,7 +211,9 @@ class Board:
 
     @property
     def published(self) -> list[tuple[Row, PaperMethod]]:
-        """The rows that the paper reports, its best first."""
+        """The rows that the paper reports, its best first; none on a board of other tasks."""
+        if not set(self.protocol.tasks) <= set(PAPER_ORDER):
+            return []
         known = [(row, method) for row in self.rows if (method := row.paper) is not None]
         return sorted(known, key=lambda pair: -published_success(pair[1], PAPER_ORDER))
 

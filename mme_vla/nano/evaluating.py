@@ -23,7 +23,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.fitting import DONE, ROW_CONFIG
-from mme_vla.play.game import MAX_CHOICES, ChoiceSession, EpisodeId
+from mme_vla.play.game import MAX_CHOICES, ChoiceSession
 from mme_vla.play.players import OraclePlayer, Player, RandomPlayer, play
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
@@ -118,10 +118,7 @@ def play_episode(job: Play) -> EpisodeRecord:
         spec.task, spec.split, spec.episode, "multi_choice", max_steps=rules.steps, render=False,
         only_possible=rules.only_possible,
     )  # fmt: skip
-    session = ChoiceSession(
-        env, EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty),
-        rules.max_choices or MAX_CHOICES, images=False,
-    )  # fmt: skip
+    session = ChoiceSession(env, spec, rules.max_choices or MAX_CHOICES, images=False)
     try:
         record = play(session, player).record(job.name, 0, 0, rules.steps)
     finally:
@@ -178,8 +175,7 @@ def play_all(
     del settings["workers"], settings["shard"]
     claim_run(folder, settings)
     if not (folder / DONE).is_file():
-        about = {"row": name, "kind": KINDS[name], "trained": False, "seed": 0, "demonstrations": None}
-        write_json(folder / DONE, about | dict.fromkeys(UNTRAINED))
+        write_json(folder / DONE, {"row": name, "kind": KINDS[name], "trained": False, "seed": 0})
         (folder / ROW_CONFIG).write_text(f"name: {name}\n", encoding="utf-8")
     file = folder / RECORDS
     known = {record.key for record in (read_records(file) if file.is_file() else ())}
@@ -190,14 +186,6 @@ def play_all(
             log.append(record)
     selected = {(spec.task, spec.episode) for spec in specs}
     return [record for record in read_records(file) if record.key in selected]
-
-
-UNTRAINED = (
-    "steps", "updates", "batch_size", "decisions", "data", "recipe", "weights", "tower", "memory", "integration",
-    "budget", "parameters", "update_s", "update_flops", "decision_flops", "minutes", "cpu_minutes", "val_loss",
-    "best_update", "accuracy", "off_by", "off_by_m",
-)  # fmt: skip
-"""Keys of `trained.json` that a row without training leaves empty."""
 
 
 def run_episodes(

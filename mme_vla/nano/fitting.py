@@ -217,8 +217,8 @@ def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
 def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:
     """Decisions to learn from, and to measure by, which history transforms do not change."""
     learning, files = job.learning, job.files
-    learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
     measured = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
+    learnt = [file for file in files if file not in measured] or files  # there may be one alone
     processor = policy.require_processor()
     processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Interval, Method, Results, aggregate, wilson
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
@@ -17,7 +18,6 @@ from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
 
 PAGE, CURVES = "page.md", "learning.png"
-LEVELS = ("easy", "medium", "hard")
 
 
 def write_page(
@@ -95,12 +95,12 @@ def success_table(
     Of several trainings: their mean ± deviation, and the interval over episodes and trainings. ends: of each trained
     model, what each training wrote: how far off its held-out decisions to go elsewhere were.
     """
-    columns = ("memory tokens", "all", "95 % interval", *LEVELS, "off by, held out", "within 2 cm")
+    columns = ("memory tokens", "all", "95 % interval", *DIFFICULTIES, "off by, held out", "within 2 cm")
     lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]
     for model, model_records in records.items():
         rate, episodes = _won(model_records) / len(model_records), len({record.episode for record in model_records})
         interval = wilson(rate, episodes)
-        levels = [[record for record in model_records if record.difficulty == level] for level in LEVELS]
+        levels = [[record for record in model_records if record.difficulty == level] for level in DIFFICULTIES]
         cells = [f"{_won(part)}/{len(part)}" if part else "" for part in (model_records, *levels)]
         deviation = ""
         average = _method(results, model_records[0]).average

@@ -34,7 +34,7 @@ _SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "se
 
 @dataclass(frozen=True)
 class Trained:
-    """What `trained.json` holds; numbers are None where nothing was trained, as for random choices.
+    """What `trained.json` holds; a row without a training, as of random choices, has no numbers.
 
     row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was a training. seed,
     recipe, data, weights: its `TrainingIdentity`. budget: memory tokens. parameters: learned ones. update_s,

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.envs.episodes import choose_episodes, choose_tasks
+from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, brief, check_choice, require
 from mme_vla.utils import read_json, write_json
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from mme_vla.nano.fitting import Training
 
 logger = logging.getLogger("mme_vla.nano")
-LEVELS = ("easy", "medium", "hard")
 SEEDS_APART = 100_000  # first seeds of two difficulties
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
 STAGES = ("record", "tokens", "train", "evaluate", "all")
@@ -230,10 +230,10 @@ def counts_of(config: Mapping[str, Any]) -> dict[tuple[str, str], int]:
     counts: dict[tuple[str, str], int] = {}
     for task in choose_tasks(config["task"]):
         amounts = {**config["demonstrations"], **(config["demonstrations_of"] or {}).get(task, {})}
-        fits = set(amounts) <= set(LEVELS) and all(isinstance(n, int) and n >= 0 for n in amounts.values())
+        fits = set(amounts) <= set(DIFFICULTIES) and all(isinstance(n, int) and n >= 0 for n in amounts.values())
         require(
             fits,
-            f"demonstrations={brief(amounts)}: write how many of each difficulty ({', '.join(LEVELS)}), such as "
+            f"demonstrations={brief(amounts)}: write how many of each difficulty ({', '.join(DIFFICULTIES)}), such as "
             "{easy: 100}.",
         )
         counts |= {(task, level): n for level, n in amounts.items()}
@@ -256,7 +256,7 @@ def record_all(
     groups, how = [], (tuple(robot.camera_names), tuple(choices), config["carried_out"], robot.action)
     for (task, level), required in counts_of(config).items():
         (folder / task).mkdir(parents=True, exist_ok=True)
-        first = int(config["first_seed"]) + LEVELS.index(level) * SEEDS_APART
+        first = int(config["first_seed"]) + DIFFICULTIES.index(level) * SEEDS_APART
         scene = Scene(task, first, level, folder / task, *how)
         groups.append(Group(map(partial(_with_seed, scene), count(first)), required))
     return demonstrate(groups, config["workers"])

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mme_vla.embodiment.action_space import Option
-    from mme_vla.play.game import ChoiceSession, Decision, EpisodeId, Reveal
+    from mme_vla.play.game import ChoiceSession, Decision, Reveal
     from mme_vla.play.players import PLAYERS, NoChoiceError, OraclePlayer, Player, RandomPlayer, build_player
     from mme_vla.play.vlm_players import GeminiPlayer, OpenAIPlayer, QwenPlayer
 
 __all__ = [
-    "PLAYERS", "ChoiceSession", "Decision", "EpisodeId", "GeminiPlayer", "NoChoiceError", "OpenAIPlayer", "Option",
+    "PLAYERS", "ChoiceSession", "Decision", "GeminiPlayer", "NoChoiceError", "OpenAIPlayer", "Option",
     "OraclePlayer", "Player", "QwenPlayer", "RandomPlayer", "Reveal", "build_player",
 ]  # fmt: skip
 
@@ -21,7 +21,7 @@ _HOMES = {
     name: f"mme_vla.{module}"
     for module, names in {
         "embodiment.action_space": ["Option"],
-        "play.game": ["ChoiceSession", "Decision", "EpisodeId", "Reveal"],
+        "play.game": ["ChoiceSession", "Decision", "Reveal"],
         "play.players": ["PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player"],
         "play.vlm_players": ["GeminiPlayer", "OpenAIPlayer", "QwenPlayer"],
     }.items()

@@ -14,23 +14,13 @@ import numpy as np
 
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
+from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
 ONGOING = "ongoing"
 UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)  # Frame of an environment that does not render
 MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
-
-
-@dataclass(frozen=True)
-class EpisodeId:
-    """Which episode of the benchmark, with the environment's seed and difficulty."""
-
-    task: str
-    split: str
-    episode: int
-    seed: int
-    difficulty: str
 
 
 @dataclass(frozen=True)
@@ -85,7 +75,7 @@ class ChoiceSession:
     def __init__(
         self,
         env: Any,
-        episode: EpisodeId,
+        episode: EpisodeSpec,
         max_choices: int = MAX_CHOICES,
         images: bool = True,
         clock: Callable[[], float] = time.perf_counter,

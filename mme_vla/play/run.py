@@ -5,15 +5,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from mme_vla.envs.episodes import choose_episodes as choose_specs
+from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
-from mme_vla.play.game import ChoiceSession, EpisodeId
+from mme_vla.play.game import ChoiceSession
 
 
-def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int, images: bool = True) -> ChoiceSession:
+def make_session(
+    episode: EpisodeSpec, env: str, max_steps: int, max_choices: int, images: bool = True
+) -> ChoiceSession:
     """The simulator for one episode.
 
     episode: which one. env: name of the environment. max_steps, max_choices: when it has timed out. images: whether the
@@ -55,9 +57,9 @@ class PlayRun:
     def __init__(
         self,
         folder: Path,
-        episodes: Sequence[EpisodeId],
+        episodes: Sequence[EpisodeSpec],
         identity: Identity,
-        make: Callable[[EpisodeId], ChoiceSession],
+        make: Callable[[EpisodeSpec], ChoiceSession],
         retry_errors: bool = False,
     ) -> None:
         self.folder, self.identity, self.make = folder, identity, make
@@ -80,7 +82,7 @@ class PlayRun:
         )
 
     def save_error(
-        self, which: EpisodeId, reason: str, session: ChoiceSession | None = None, **extra: Any
+        self, which: EpisodeSpec, reason: str, session: ChoiceSession | None = None, **extra: Any
     ) -> EpisodeRecord:
         """Write that an episode could not be played to its end.
 
@@ -100,7 +102,7 @@ class PlayRun:
         )  # fmt: skip
         return self._keep(which, record)
 
-    def _keep(self, which: EpisodeId, record: EpisodeRecord) -> EpisodeRecord:
+    def _keep(self, which: EpisodeSpec, record: EpisodeRecord) -> EpisodeRecord:
         self._log.append(record)
         self.records.append(record)
         if which in self.todo:
@@ -126,9 +128,3 @@ class PlayRun:
 
     def __exit__(self, *_: object) -> None:
         self._log.close()
-
-
-def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str, env: str = "mme_vla") -> list[EpisodeId]:
-    """The episodes that the command line names, by the grammar of `mme_vla.envs.episodes`."""
-    specs = choose_specs(tasks, episodes, split, env)
-    return [EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty) for spec in specs]

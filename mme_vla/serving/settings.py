@@ -102,8 +102,3 @@ class ServeSettings:
             f"action_space={self.action_space}: this policy returns {robot.action.answers}, "
             f"{robot.action.width} numbers an action, and nothing is converted. The client has to convert.",
         )
-
-    @property
-    def local_only(self) -> bool:
-        """Whether only programs on this machine can connect."""
-        return is_local(self.host)

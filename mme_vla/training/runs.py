@@ -7,6 +7,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+from mme_vla.config.naming import flat
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, require
 from mme_vla.policy.base import Policy
@@ -143,7 +144,7 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Dotted keys whose values differ and must not, with both values."""
-    before, after = (_flat(to_json(values)) for values in (old, new))
+    before, after = (flat(to_json(values)) for values in (old, new))
     return {
         key: (before.get(key), after.get(key))
         for key in sorted(before.keys() | after.keys())
@@ -189,16 +190,6 @@ def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str
 
 def _holds_run(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
 
 
 def _newest_unfinished(folder: Path) -> Path | None:

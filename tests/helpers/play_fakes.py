@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.play import ChoiceSession, EpisodeId
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.play import ChoiceSession
 
 OPTIONS = [
     {"label": "a", "action": "press the block", "need_parameter": True},
@@ -61,8 +62,8 @@ class BlocksEnv:
         return {"front_rgb_list": frames, "joint_state_list": [np.zeros(7)] * count}
 
 
-def an_episode(number: int = 0) -> EpisodeId:
-    return EpisodeId("VideoUnmask", "test", number, 560000 + 100 * number, "easy")
+def an_episode(number: int = 0) -> EpisodeSpec:
+    return EpisodeSpec("VideoUnmask", "test", number, 560000 + 100 * number, "easy")
 
 
 def a_session(number: int = 0, **options: Any) -> ChoiceSession:

@@ -25,7 +25,7 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
     """The goals of a recording, by task: out of its dataset, or of its official files where there is none."""
     goals: dict[str, set[str]] = {}
     if dataset is not None:
-        from mme_vla.data.convert import SIDE_FILE
+        from mme_vla.data.lerobot_files import SIDE_FILE
 
         for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")["episodes"]:
             goals.setdefault(episode["task"], set()).add(episode["goals"][0])

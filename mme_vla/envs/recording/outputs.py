@@ -207,7 +207,8 @@ class RecordingPlan:
         return True
 
     def _is_dataset(self, options: "ConvertOptions") -> bool:
-        from mme_vla.data.convert import SIDE_FILE, planned_options
+        from mme_vla.data.convert import planned_options
+        from mme_vla.data.lerobot_files import SIDE_FILE
 
         assert self.dataset is not None
         if not (self.dataset / SIDE_FILE).is_file():

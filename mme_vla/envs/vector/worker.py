@@ -99,7 +99,7 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
         return arrays[value.index]
     if isinstance(value, dict):
         return {key: restore(item, arrays) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if type(value) in (list, tuple):
         return type(value)(restore(item, arrays) for item in value)
     return value
 

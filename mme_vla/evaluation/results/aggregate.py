@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mme_vla.envs.metadata import is_other
+from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
 from mme_vla.evaluation.results.scopes import (
-    DIFFICULTIES,
     MAX_STEPS,
     PAPER_ORDER,
     TASK_FACTS,

@@ -7,7 +7,6 @@ from typing import NamedTuple
 from mme_vla.errors import require
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 
-DIFFICULTIES = ("easy", "medium", "hard")
 SUITES = ("Counting", "Permanence", "Reference", "Imitation")
 GROUPS = (
     "Motion-Centric",
