@@ -1,5 +1,6 @@
 """The pages of nanoMME's board hold what its committed rows say."""
 
+import lzma
 from pathlib import Path
 
 import nano_board
@@ -45,12 +46,15 @@ def test_rows_of_a_run_are_added_and_reach_the_page(tmp_path: Path, monkeypatch:
     write_training(tmp_path / "run", "pi05", 0, {TASKS[0]: 1})
     write_json(tmp_path / "run" / "scenes.json", {"split": "further", "tried": {f"{TASKS[0]} 0": ""}})
     conditions = {"checkpoint": {"folder": "/somewhere/pi05/0", "files": {}}}
-    receipt = {"settings": {"source": "pi05/0"}, "conditions": [conditions]}
+    receipt = {"settings": {"source": "pi05/0"}, "conditions": [conditions], "records": {}, "scenes": "", "score": {}}
     write_json(tmp_path / "run" / "pi05" / "0" / "receipt.json", with_checksum(receipt))
     nano_board.add(tmp_path / "run" / "pi05")
     added = read_receipt(tmp_path / "rows" / "further" / "pi05" / "0" / "receipt.json")
     assert added["conditions"][0]["checkpoint"]["folder"] == "pi05/0"
     assert [path.name for path in sorted((tmp_path / "rows" / "further").iterdir())] == ["pi05", "scenes.json"]
+    packed = tmp_path / "run" / "pi05" / "0" / "episodes.jsonl"
+    packed.with_suffix(".jsonl.xz").write_bytes(lzma.compress(packed.read_bytes()))
+    packed.unlink()
     nano_board.add(tmp_path / "run")
     (board,) = nano_board.boards()
     text = nano_board.block(board)

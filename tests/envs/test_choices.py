@@ -94,6 +94,7 @@ def test_impossible_choices_are_refused_by_the_key(changes: dict[str, Any], mess
 @pytest.mark.parametrize(
     "given",
     [None, [], "abc", [{"label": "z", "action": "go"}], [{"label": "a"}], EIGHT + EIGHT[:1], EIGHT[:1] * 2,
+     [{"label": "a", "action": "go", "possible": False}],
      [{"label": "a", "action": "go", "need_parameter": "yes"}], [{"label": "a", "action": "go " * 200}]],
 )  # fmt: skip
 def test_options_that_nobody_can_choose_among_are_refused(given: Any) -> None:

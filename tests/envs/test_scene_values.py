@@ -111,8 +111,8 @@ def test_steps_in_a_scene_from_values_are_the_same() -> None:
 
 def test_a_file_of_scenes_is_a_split(tmp_path: Path) -> None:
     path = tmp_path / "scenes.jsonl"
-    rows = [row_of("PickXtimes", episode=1), row_of("StopCube"), row_of("PickXtimes")]
-    path.write_text("\n".join(json.dumps(row) for row in rows) + "\n")
+    rows = [row_of("PickXtimes", episode=1) | {"note": "a\u2028b"}, row_of("StopCube"), row_of("PickXtimes")]
+    path.write_text("\n".join(json.dumps(row, ensure_ascii=False) for row in rows) + "\n", encoding="utf-8")
     specs = metadata.episodes("PickXtimes", str(path))
     assert [spec.seed for spec in specs] == [rows[0]["seed"], rows[2]["seed"]]
     assert metadata.episodes("MoveCube", str(path)) == []

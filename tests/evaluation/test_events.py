@@ -243,6 +243,7 @@ def test_a_custom_environment_names_the_action_that_keeps_its_robot() -> None:
     assert [state.item() for state in observation["state_list"]] == [1.0] * 5 and not truncated
     assert [image[0, 0, 0] for image in observation["front_rgb_list"]] == [2, 3, 4, 5, 6]
     assert [env.step(np.ones(1))[3] for _ in range(2)] == [False, True], "three actions and five steps of the pause"
+    assert env.oracle() is None, "this environment has no script"
     Braked().check_hold()
     with pytest.raises(UserError, match="Rails cannot pause: implement hold"):
         Rails().check_hold()

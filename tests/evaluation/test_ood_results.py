@@ -84,3 +84,29 @@ def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFix
     visible = capsys.readouterr().out
     assert "RoboMME-OOD" in visible and "Hard test episodes" in visible and "Extrapolation" in visible
     assert "SimpleMemVLA" in text.read_text() and "<svg" in page.read_text()
+
+
+def test_records_without_a_table_of_this_kind_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for record in made("MoveCube", "ood", [1, 0]):
+            log.append(record)
+    main([str(tmp_path), "--ood"])
+    assert "Extrapolation" not in capsys.readouterr().out, "nothing grows in MoveCube"
+    with RecordLog(tmp_path / "plain" / "episodes.jsonl") as log:
+        for record in made("MoveCube", "test", [1, 0]):
+            log.append(record)
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / "plain"), "--ood"])
+    assert "None of these records is of RoboMME-OOD" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [("--ood --stress", "--stress and --ood: name one"), ("--ood --csv t.csv", "--csv: not with --ood")],
+)
+def test_views_exclude_each_other(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        log.append(made("PatternLock", "ood", [1])[0])
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), *words.split()])
+    assert message in capsys.readouterr().err

@@ -15,7 +15,7 @@ from mme_vla.evaluation import receipts
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import checkpoint_label, facts_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RecordLog, claim_run
+from mme_vla.evaluation.store import RecordLog, claim_run, fingerprint
 from mme_vla.policy.base import Policy
 
 
@@ -107,6 +107,23 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
     differences, _ = receipts.verify(path)
     starts = [line.split(":")[0] for line in differences]
     assert {"records.sha256", "score.VideoUnmask.success", "scenes", "scene VideoUnmask 0"} <= set(starts)
+    other = tmp_path / "receipt-of-something-else.json"
+    other.write_text(json.dumps({"settings": {}}))
+    with pytest.raises(UserError, match="is no receipt of an evaluation: it has no conditions, records"):
+        receipts.verify(other)
     path.write_text(path.read_text().replace('"success": 1', '"success": 3'))
     with pytest.raises(UserError, match="is not what was written"):
         receipts.verify(path)
+
+
+def test_scenes_of_an_environment_that_is_not_here_are_a_note(checkpoint: Path, tmp_path: Path) -> None:
+    path = run(tmp_path, checkpoint)
+    for name in ("receipt.json", "run.json"):
+        content = json.loads((tmp_path / name).read_text())
+        content.pop("crc32")
+        content["settings"]["env"] = "of_a_plugin"
+        if name == "run.json":
+            content["fingerprint"] = fingerprint(content["settings"])
+        (tmp_path / name).write_text(json.dumps(content))
+    differences, notes = receipts.verify(path)
+    assert not differences and any(note.startswith("scenes: not compared") for note in notes)

@@ -89,6 +89,22 @@ def test_an_episode_that_cannot_begin_is_a_trajectory_without_decisions(policy: 
     assert trajectories[JOBS[0]].error is None and len(trajectories[JOBS[0]].chunks) == 1
 
 
+def test_an_error_in_a_step_ends_its_episode_alone(policy: MMEPolicy) -> None:
+    def step(action: Any) -> Any:
+        raise RuntimeError("the simulator diverged")
+
+    def make_env(task: str, split: str, episode: int, max_steps: int) -> Any:
+        env = two_choices(task, split, episode, max_steps)
+        if episode == 1:
+            env.step = step
+        return env
+
+    trajectories = {t.job: t for t in rollouts(policy, make_env, JOBS[:3], ())}
+    broken = trajectories[JOBS[1]]
+    assert broken.outcome == "error" and "the simulator diverged" in str(broken.error)
+    assert [trajectories[job].error for job in (JOBS[0], JOBS[2])] == [None, None]
+
+
 def test_the_same_seed_repeats_a_rollout_and_another_does_not(policy: MMEPolicy) -> None:
     chunks = [torch.cat([t.chunks for t in rollouts(policy, two_choices, JOBS, (), seed=seed)]) for seed in (1, 1, 2)]
     assert torch.equal(chunks[0], chunks[1]) and not torch.equal(chunks[0], chunks[2])

@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
              for n in "01"]  # fmt: skip
     assert [one and one.seed for one in seeds] == [0, 1] and seeds[0] != seeds[1]
     about = read_json(tmp_path / "run" / "further" / "framesamp_modul@2" / "1" / "trained.json", "a row")
-    assert (about["row"], about["seed"], about["budget"], about["decisions"]) == ("framesamp_modul@2", 1, 2, 6)
+    assert (about["row"], about["seed"], about["budget"], about["decisions"]) == ("framesamp_modul@2", 1, 2, 3)
     assert about["demonstrations"] == {"VideoUnmask": 2} and about["parameters"] > 1e6 and about["update_flops"] > 1e6
     runs.run(resolved(compose("nano", words)))
     assert len(made) == 2, "a finished run is not made again"
@@ -98,3 +99,20 @@ def test_the_digest_of_demonstrations_is_of_their_scenes_and_choices(tmp_path: P
     same = {name for name, digest in digests.items() if digest == digests["a"]}
     assert same == {"a", "rendered elsewhere", "another processor"}
     assert Demonstration.load(tmp_path / "a.npz").length == 180
+
+
+@pytest.mark.parametrize("count", [1, 2, 9, 10, 21])
+def test_no_demonstration_is_learned_from_and_measured(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files, reads = [tmp_path / f"{number}.npz" for number in range(count)], []
+    monkeypatch.setattr(fitting, "statistics", lambda *_: None)
+    monkeypatch.setattr(fitting.Demonstration, "load", lambda file, images: file)
+    monkeypatch.setattr(fitting.Decisions, "of", lambda policy, made, *_, **__: reads.append([f for f, _ in made]))
+    store = SimpleNamespace(read=lambda file: file)
+    learning = dict.fromkeys(("elsewhere", "reflect", "sides", "often", "noise", "blur", "balanced"))
+    job = SimpleNamespace(learning=learning, files=files, store=store, config={"seed": 0})
+    fitting.prepared(SimpleNamespace(require_processor=SimpleNamespace), job)
+    learned, measured = reads
+    assert len(measured) == max(1, count // 10) and (count == 1 or not set(learned) & set(measured))
+    assert set(learned) | set(measured) == set(files)

@@ -19,7 +19,7 @@ from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.memory.ttt import TTT
 from mme_vla.probing.evidence import EvidenceEpisode, record_evidence
-from mme_vla.probing.writing import FRAMES, required_frames, score_episode, score_writing, writing_table
+from mme_vla.probing.writing import FRAMES, LONGEST, required_frames, score_episode, score_writing, writing_table
 
 FACTS = {"a": np.arange(10), "b": np.arange(20, 30)}
 
@@ -63,6 +63,9 @@ def test_chance_is_the_expectation_for_as_many_frames_at_random() -> None:
 
 def test_an_episode_without_facts_has_no_score() -> None:
     assert score_episode(lambda step: np.array([step]), {}, length=50, exec_start=10) is None
+    assert score_writing("oracle", []).tasks == {}, "no scene could be built"
+    nothing, scored = score_writing("oracle", []), score_writing("oracle", [synthetic()])
+    assert writing_table({"a": nothing, "oracle": scored}) == writing_table({"oracle": scored})
     assert score_episode(lambda step: np.array([step]), {"late": np.array([49])}, length=50, exec_start=10) is None
 
 
@@ -86,7 +89,7 @@ def test_a_memory_that_selects_by_index_is_scored_without_an_image() -> None:
 
 
 def test_images_are_required_of_the_frames_that_a_memory_scores_or_reads() -> None:
-    scored = frozenset([0, *range(7, 2000, 8)])
+    scored = frozenset([0, *range(7, LONGEST, 8)])
     assert required_frames(TokenDrop(32, 16, grid=4)) == scored
     assert required_frames(Events(32, 16)) == scored, "its states need no image"
     assert required_frames(Retrieval(32, 16, every=8)) == scored

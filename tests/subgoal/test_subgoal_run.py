@@ -9,7 +9,7 @@ from helpers.rollout_fakes import FACTS, JOBS, quick_policy
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import run_settings
+from mme_vla.evaluation.rollout.evaluation import predictor_of, run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import BackgroundPredictor, Oracle, Usage, build_predictor
 
@@ -57,6 +57,10 @@ def test_subgoals_and_policies_must_go_together(caplog: pytest.LogCaptureFixture
     with pytest.raises(UserError, match="reads no subgoal"):
         choose_subgoals(quick_policy("pi05"), oracle)
     assert choose_subgoals(quick_policy("simplesg"), None) is None
+    assert [predictor_of(quick_policy(name), "oracle").kind for name in ("simplesg", "groundsg")] == [
+        "simple",
+        "grounded",
+    ], "a name in Python"
     assert "plain prompt" in caplog.text
 
 

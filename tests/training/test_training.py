@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +204,12 @@ def test_too_small_a_disk_is_detected_before_training(tmp_path: Path, monkeypatc
     monkeypatch.setattr("shutil.disk_usage", lambda path: os.terminal_size((0, 0)) and type("Usage", (), {"free": 10}))
     with pytest.raises(UserError, match="free"):
         check_disk(tmp_path / "not" / "there", policy(), KeepRule())
+    low = policy().bfloat16()  # stored in float32
+    needed = 2 * sum(4 * p.numel() * (4 if p.requires_grad else 1) for p in low.parameters())
+    for free, fits in ((needed, True), (needed - 1, False)):
+        monkeypatch.setattr("shutil.disk_usage", lambda path, free=free: type("Usage", (), {"free": free}))
+        with nullcontext() if fits else pytest.raises(UserError, match="free"):
+            check_disk(tmp_path, low, KeepRule(last=1))
 
 
 def log_twice(folder: Path, section: dict[str, Any]) -> None:
