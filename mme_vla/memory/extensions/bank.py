@@ -281,24 +281,34 @@ class MemoryBank(Retrieval):
             Entries [b, k, n, d] without gradients, times [b, k] and whether there is such an entry [b, k], k ≤ length,
             the empty places in front.
         """
-        moments = moments.detach()
-        entries, at, there = (x[:, : self.length] for x in (moments, times, valid))
-        for step in range(self.length, moments.shape[1]):
-            now = slice(step, step + 1)
-            entries, at, there = (torch.cat(x, 1) for x in ((entries, moments[:, now]), (at, times[:, now]),
-                                                            (there, valid[:, now])))  # fmt: skip
+        entries = moments.detach().clone()  # two that become one are written where the earlier was
+
+        def entries_at(places: Tensor) -> Tensor:
+            return entries.gather(1, places[..., None, None].expand(-1, -1, *entries.shape[2:]))
+
+        def similarity(first: Tensor, second: Tensor) -> Tensor:
+            return functional.cosine_similarity(entries_at(first), entries_at(second), dim=-1).mean(-1)
+
+        places = torch.arange(self.length, device=times.device)[None]
+        held = places[:, : times.shape[1]].expand(len(times), -1)  # b k: which of the moments
+        alike = similarity(held[:, :-1], held[:, 1:])  # of neighbours; merging changes two of them
+        for step in range(self.length, times.shape[1]):
+            held = torch.cat([held, torch.full_like(held[:, :1], step)], 1)
             # Where the first place is empty it goes; else the oldest does, or two neighbours become one.
-            pair = torch.full_like(at[:, :1], -1)
+            pair = torch.full_like(held[:, :1], -1)
             if self.consolidation == "tome":
-                alike = functional.cosine_similarity(entries[:, :-1], entries[:, 1:], dim=-1).mean(-1)
-                pair = torch.where(there[:, :1], alike.argmax(1, keepdim=True), pair)
-            places = torch.arange(self.length, device=at.device)[None]
-            rows = places + (places > pair).long()
-            follows = (places == pair)[..., None, None]
-            gathered = entries.gather(1, rows[..., None, None].expand(-1, -1, *entries.shape[2:]))
-            entries = torch.where(follows, (entries[:, :-1] + entries[:, 1:]) / 2, gathered)
-            at, there = at.gather(1, rows), there.gather(1, rows)
-        return entries, at, there
+                alike = torch.cat([alike, similarity(held[:, -2:-1], held[:, -1:])], 1)
+                pair = torch.where(valid.gather(1, held[:, :1]), alike.argmax(1, keepdim=True), pair)
+                both = entries_at(held.gather(1, torch.cat([pair, pair + 1], 1).clamp(min=0)))
+                one = torch.where((pair < 0)[..., None, None], both[:, :1], both.mean(1, keepdim=True))
+                earlier = held.gather(1, pair.clamp(min=0))[..., None, None].expand_as(one)
+                entries.scatter_(1, earlier, one)
+                alike = alike.gather(1, places[:, :-1] + (places[:, :-1] >= pair).long())
+            held = held.gather(1, places + (places > pair).long())
+            if self.consolidation == "tome" and self.length > 1:
+                left = torch.cat([pair - 1, pair], 1).clamp(0, self.length - 2)
+                alike = alike.scatter(1, left, similarity(held.gather(1, left), held.gather(1, left + 1)))
+        return entries_at(held), times.gather(1, held), valid.gather(1, held)
 
     def run(
         self, tokens: Tensor, times: Tensor, sequences: Sequence[Tensor], states: Sequence[BankState] | None = None
