@@ -75,7 +75,10 @@ class Desk:
 
     def proceed(self) -> None:
         """Go on after the end of an episode, or try again after a breakdown; otherwise nothing happens."""
-        if self.phase in ("ended", "broken"):
+        session = self.session
+        if self.phase == "broken" and session is not None and session.over and session.episode in self.run.todo:
+            self._work(lambda: self._after(session))  # it was played, and could not be saved
+        elif self.phase in ("ended", "broken"):
             self.begin()
 
     # What the page shows ------------------------------------------------------------------------------------------

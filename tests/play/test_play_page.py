@@ -197,6 +197,26 @@ def test_an_episode_that_cannot_be_set_up_is_reported_and_can_be_retried(tmp_pat
         assert page.until("choosing")["error"] == ""
 
 
+def test_an_episode_that_cannot_be_saved_is_not_lost(tmp_path, monkeypatch):
+    with served(tmp_path) as page:
+        keep, full = page.run.save, [OSError("No space left on device")]
+
+        def save(*args, **how):
+            if full:
+                raise full.pop()
+            return keep(*args, **how)
+
+        monkeypatch.setattr(page.run, "save", save)
+        while page.state()["phase"] in ("loading", "choosing", "moving"):
+            state = page.state()
+            if state["phase"] == "choosing":
+                decision = {"session": state["session"], "decision": len(state["decisions"])}
+                page.ask("POST", "/choose", {"choice": "a", "point": [10, 20], **decision})
+        assert "No space left" in page.until("broken")["error"] and page.state()["played"] == 0
+        page.ask("POST", "/next", {})
+        assert page.until("ended")["played"] == 1 and len(read_records(tmp_path / "episodes.jsonl")) == 1
+
+
 # In a browser -----------------------------------------------------------------------------------------------------
 
 
