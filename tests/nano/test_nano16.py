@@ -127,8 +127,9 @@ def test_what_is_not_possible_is_listed_and_not_selected() -> None:
 
 def test_what_is_possible_is_queried_again_after_each_choice() -> None:
     def info(possible: bool) -> dict[str, object]:
-        option = {"label": "b", "action": "pick up", "need_parameter": False, "possible": possible}
-        return {"task_goal": ["do it"], "available_multi_choices": [option], "executed": 1, "steps": 1}
+        press = {"label": "a", "action": "press", "need_parameter": False}
+        options = [{"label": "b", "action": "pick up", "need_parameter": False, "possible": possible}, press]
+        return {"task_goal": ["do it"], "available_multi_choices": options, "executed": 1, "steps": 1}
 
     frames = {"state": np.zeros((1, 8), np.float32), "front": [np.zeros((256, 256, 3), np.uint8)]}
     running = RunningEpisode(policy("pi05"), Job("StopCube", "test", 0), 0, None, 32, None)
