@@ -20,7 +20,7 @@ from mme_vla.data.columns import BOUNDARY, SUBTASK, with_labels
 from mme_vla.embodiment.action_space import MIDDLE, ActionSpace
 from mme_vla.errors import require
 from mme_vla.memory.base import Memory, stack_history, uses_proprio
-from mme_vla.memory.history import FrameScores, History, StorageSpec
+from mme_vla.memory.history import CachedHistory, History
 from mme_vla.memory.transforms import HistoryTransform, TransformedHistory, map_frames
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.tokens import FrameTokens, tokenize
@@ -42,34 +42,6 @@ FrameLabels = Mapping[str, Callable[[np.ndarray], np.ndarray]]
 JOINT_NOISE = 0.05
 VIEW_NOISE = 0.25  # on tokens of current images: what points at an object reads its place there
 MIN_DISTANCE = 0.05  # Metres above the table from where on a motion is one to another place
-
-
-class SparseHistory(History):
-    """The tokens of some of an episode's frames; any other frame is refused.
-
-    length: of the episode. frames: [n] ascending. tokens: [n, patches, d_vision].
-    """
-
-    def __init__(
-        self, spec: StorageSpec, length: int, frames: np.ndarray, tokens: Tensor, exec_start: int, scores: FrameScores
-    ) -> None:
-        super().__init__(spec, exec_start)
-        self._length, self._frames, self._tokens, self._scores = length, frames, tokens, scores
-
-    def __len__(self) -> int:
-        return self._length
-
-    @property
-    def scores(self) -> FrameScores:
-        return self._scores
-
-    @property
-    def stored_frames(self) -> np.ndarray:
-        return self._frames
-
-    def gather(self, indices: np.ndarray) -> Tensor:
-        rows = self._row_of(indices[:, 0], self._frames)
-        return self._tokens[torch.as_tensor(rows), torch.as_tensor(indices[:, 1])]
 
 
 @dataclass(frozen=True)
@@ -396,10 +368,8 @@ def _history(policy: MMEPolicy, demonstration: Demonstration, made: FrameTokens)
     read = policy.frames_read(np.array(_decisions(policy, demonstration)), demonstration.exec_start)
     frames = np.intersect1d(read, made.frames[camera])
     tokens = pool_grid(made.at(camera, frames).float(), memory.storage.grid, memory.storage.pooling)
-    history = SparseHistory(
-        memory.storage, demonstration.length, frames, tokens.to(policy.history_dtype), demonstration.exec_start,
-        made.scores.get(memory.storage.scorer) or FrameScores.empty(memory.storage.grid**2),
-    )  # fmt: skip
+    stored, scores = tokens.to(policy.history_dtype).float().numpy(), made.scores.get(memory.storage.scorer)
+    history = CachedHistory(memory.storage, stored, frames, demonstration.length, scores, demonstration.exec_start)
     if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
         length = demonstration.length
         nothing = np.zeros((length, policy.embodiment.action.width), np.float32)
