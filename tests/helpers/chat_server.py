@@ -1,4 +1,4 @@
-"""A server on this machine that speaks OpenAI's chat completions and says what it is told to."""
+"""A server on this machine that answers a model's requests, such as OpenAI's chat completions, as it is told to."""
 
 import json
 import threading
@@ -35,7 +35,8 @@ class ChatServer:
 
 
 @contextmanager
-def chat_server() -> Iterator[ChatServer]:
+def chat_server(path: str | None = "/v1/chat/completions") -> Iterator[ChatServer]:
+    """Serve until the end of the block. path: of the requests it answers; None for any."""
     state = ChatServer()
 
     class Handler(BaseHTTPRequestHandler):
@@ -43,7 +44,7 @@ def chat_server() -> Iterator[ChatServer]:
             request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             state.requests.append(request)
             state.keys.append(self.headers.get("Authorization", ""))
-            code, body = state.respond(request) if self.path == "/v1/chat/completions" else failure(404, self.path)
+            code, body = state.respond(request) if path in (None, self.path) else failure(404, self.path)
             data = json.dumps(body).encode()
             self.send_response(code)
             self.send_header("Content-Type", "application/json")

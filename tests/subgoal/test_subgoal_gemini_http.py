@@ -1,15 +1,13 @@
 """The prompted model through google-genai itself, against a local server; skipped where the extra is not installed."""
 
 import base64
-import json
 import logging
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 
+from helpers.chat_server import ChatServer, chat_server
 from mme_vla.subgoal import Gemini
 
 pytest.importorskip("google.genai", reason="needs the extra gemini")
@@ -26,39 +24,15 @@ def failure(code: int, message: str) -> tuple[int, dict]:
     return code, {"error": {"code": code, "message": message, "status": "ERROR"}}
 
 
-class Server:
-    def __init__(self) -> None:
-        self.answers: list[tuple[int, dict]] = []
-        self.requests: list[dict] = []
-
-
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
-    state = Server()
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            state.requests.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            code, body = state.answers.pop(0)
-            data = json.dumps(body).encode()
-            self.send_response(code)
-            self.send_header("Content-Type", "application/json")
-            self.send_header("Content-Length", str(len(data)))
-            self.end_headers()
-            self.wfile.write(data)
-
-        def log_message(self, *args: object) -> None:
-            pass
-
-    http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    threading.Thread(target=http.serve_forever, daemon=True).start()
-    monkeypatch.setenv("GOOGLE_GEMINI_BASE_URL", f"http://127.0.0.1:{http.server_port}")
-    monkeypatch.setenv("GEMINI_API_KEY", SECRET)
-    yield state
-    http.shutdown()
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[ChatServer]:
+    with chat_server(path=None) as state:
+        monkeypatch.setenv("GOOGLE_GEMINI_BASE_URL", state.url.removesuffix("/v1"))
+        monkeypatch.setenv("GEMINI_API_KEY", SECRET)
+        yield state
 
 
-def test_a_conversation_over_http(server: Server, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_conversation_over_http(server: ChatServer, caplog: pytest.LogCaptureFixture) -> None:
     server.answers = [
         failure(503, "overloaded"),
         reply('{"subgoal_sequence": ["a"], "subgoal": "press the button at <500, 250>"}'),
