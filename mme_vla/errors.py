@@ -24,9 +24,10 @@ def check_choice(key: str, value: object, options: Iterable[str]) -> None:
 
 
 def check_sizes(section: str, **sizes: int) -> None:
-    """Make sure that numbers of a section are at least 1."""
+    """Make sure that numbers of a section are whole and at least 1."""
     for key, value in sizes.items():
-        require(value >= 1, f"{section}.{key}={value} must be at least 1.")
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        require(whole and value >= 1, f"{section}.{key}={brief(value)} must be at least 1, a whole number.")
 
 
 LARGEST = 2**16

@@ -5,7 +5,7 @@
     Injection, noise ─ backbone.loss or backbone.sample ──► loss [b, h] or chunk [b, h, a]
 
 Data flows down once. The backbone does not call the integration, and neither knows which memory made the tokens. It
-needs torch, numpy, einops and timm; configuration, datasets and simulation are in other packages.
+needs torch, numpy and timm; configuration, datasets and simulation are in other packages.
 
     backbone/   base.py (interface) · layers.py (visibility, attention, norms) · gemma.py (joint experts,
                 KV cache) · siglip.py · flow.py · pi05.py
@@ -174,7 +174,7 @@ class MMEModel(nn.Module):
         if past is not None:
             count = past.images.shape[1]
             repeated = None if augmentation is None else augmentation.repeat_interleave(count, 0)
-            images = self.transform_images(past.images.flatten(0, 1), repeated).unflatten(0, (-1, count))
+            images = self.transform_images(past.images.flatten(0, 1), repeated).unflatten(0, past.images.shape[:2])
             past = replace(past, images=images)
         return replace(batch, images=self.transform_images(batch.images, augmentation), past=past)
 

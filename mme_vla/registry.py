@@ -41,6 +41,11 @@ class Registry[T]:
                 ),
                 f"{self.kind} {name!r} is already registered by {taken!r}; choose another name.",
             )
+            home = self._shipped.get(name)
+            require(
+                taken is not None or home in (None, getattr(entry, "__module__", None)),
+                f"{self.kind} {name!r} ships with the library ({home}); choose another name.",
+            )
             self._entries[name] = entry
             return entry
 
@@ -69,14 +74,14 @@ class Registry[T]:
         what = f"{self.kind} {section['name']!r}"
         if twice := sorted(set(options) & set(fixed)):
             raise UserError(f"{what}: {twice[0]} is not an option; it follows from the other parts.")
-        signature = inspect.signature(entry)
+        accepted, open_ended = _keywords(entry)
+        takes = [name for name in accepted if name not in fixed][len(args) :]
+        unknown = [] if open_ended else [name for name in options if name not in takes]
         try:
-            signature.bind(*args, **fixed, **options)
+            inspect.signature(entry).bind(*args, **fixed, **options)
+            if unknown:
+                raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}")
         except TypeError as error:
-            kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-            accepted = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
-            takes = accepted[len(args) :]
-            unknown = [name for name in options if name not in takes]
             hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
             options_text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
             raise UserError(f"{what} does not take these options: {options_text} ({error}). {hint}") from None
@@ -87,6 +92,24 @@ class Registry[T]:
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted({*self._entries, *self._shipped}))
+
+
+def _keywords(entry: Any) -> tuple[list[str], bool]:
+    """Names of the arguments that a constructor takes, and whether it takes any others.
+
+    A class that passes `**options` on to its base takes those of the base.
+    """
+    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    makers = (
+        [vars(c)["__init__"] for c in entry.__mro__ if "__init__" in vars(c)] if inspect.isclass(entry) else [entry]
+    )
+    names: dict[str, None] = {}
+    for make in makers:
+        parameters = inspect.signature(make).parameters.values()
+        names |= {p.name: None for p in parameters if p.kind in kinds and p.name != "self"}
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+            return list(names), False
+    return list(names), True
 
 
 MEMORIES: Registry[Any] = Registry(

@@ -214,7 +214,7 @@ class CleanFlowHead(FlowHead):
 
 
 class HasFlowHead:
-    """Capability of a backbone: its chunks are learned and sampled by a `FlowHead`, so they support real-time chunking.
+    """Capability of a backbone: its chunks are learned and sampled by a `FlowHead`.
 
     A subclass calls `make_head` in its constructor.
     """

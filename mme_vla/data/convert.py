@@ -93,7 +93,7 @@ class ConvertOptions:
 
     images: `video`, or `png` for lossless images inside the tables (about ten times larger).
     names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own policies ask for
-        (`columns.NAMES`). Readers here take either.
+        (`lerobot_files.NAMES`). Readers here take either.
     fps: frames per second; 20 is the simulator's control rate.
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.

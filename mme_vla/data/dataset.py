@@ -310,9 +310,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return motion_rows(self.processor, *self.sources[source].robot_motion(episode, frames, self.action_offset))
 
     def _sample(self, step: Step, subgoal: str | None, now: int, frames: FrameMap | None) -> Sample:
-        """A step with the frames of its window; before the episode's first frame that one is repeated."""
+        """A step with the frames of its window; before the first frame of the execution that one is repeated."""
         source, cameras = self.sources[step.source], self._cameras
-        window = np.arange(now - self.processor.samples.window + 1, now + 1).clip(min=0)
+        start = int(source.exec_starts[step.episode]) if frames is None else frames.exec_start
+        window = np.arange(now - self.processor.samples.window + 1, now + 1).clip(min=min(start, now))
         window = window if frames is None else frames.real[window]
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)

@@ -268,7 +268,12 @@ class EpisodeSource:
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
         """The subgoal texts of one step, lower-case, under the names in `subgoal_names`."""
         row = self._rows(episode, step, step + 1)
-        return {name: str(_flat(row[name])[0].as_py()).lower() for name in self.subgoal_names}
+        texts = {name: _flat(row[name])[0].as_py() for name in self.subgoal_names}
+        for name, text in texts.items():
+            require(
+                text is not None, f"{self.root}: {name} of frame {step} of episode {episode} has no value. {REMEDY}"
+            )
+        return {name: str(text).lower() for name, text in texts.items()}
 
     def frames(self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
         """Decode images [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory."""

@@ -5,15 +5,20 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import require
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 
 
 def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
-    """Frames 0 … `step`: all of them while they fit in `count`, else `count` evenly spaced ones, both ends included."""
-    return np.arange(step + 1) if step < count else np.linspace(0, step, count).astype(np.int64)
+    """Frames 0 … `step`: all of them while they fit in `count`, else `count` evenly spaced ones, both ends included.
+
+    One frame is the current one.
+    """
+    if step < count:
+        return np.arange(step + 1)
+    return np.linspace(0, step, count).astype(np.int64) if count > 1 else np.array([step])
 
 
 def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> np.ndarray:
@@ -24,6 +29,7 @@ def evenly_spaced_stored_frames(storage: StorageSpec, step: int, count: int) -> 
 
 def budget_frames(budget: int, grid: int, at_least: int = 1) -> int:
     """How many frames of grid×grid tokens a budget holds; raises `UserError` unless it holds whole ones, and enough."""
+    check_sizes("memory", budget=budget, grid=grid)
     least = max(budget // grid**2, at_least) * grid**2
     require(
         budget == least,

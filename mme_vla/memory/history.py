@@ -39,7 +39,9 @@ class StorageSpec:
     def __post_init__(self) -> None:
         check_sizes("memory", grid=self.grid)
         check_choice("memory.pooling", self.pooling, ("mean", "max"))
-        require(self.keep_every >= 1, f"memory: keeping every {self.keep_every}th frame is not possible: at least 1.")
+        every = self.keep_every
+        whole = isinstance(every, int) and every >= 1
+        require(whole, f"memory: keeping every {every}th frame is not possible: give a whole number, at least 1.")
 
     def keeps(self, frame: int) -> bool:
         """Whether tokens of this frame are stored."""
@@ -265,13 +267,13 @@ class OnlineHistory(History):
         """Add frames in order.
 
         Args:
-            frames: images [n, H, W, 3] uint8. tokens: of the wanted ones, [wanted, patches, d_vision].
+            frames: images [n, H, W, 3] uint8. tokens: of those of `to_encode`, [k, patches, d_vision].
             rendered: offsets [n] of the images among the frames, of which there are `count`; by default they are all.
         """
         count = len(frames) if count is None else count
         offsets, numbers = self.to_encode(count, rendered), np.arange(count) if rendered is None else rendered
         if len(tokens) != len(offsets):
-            raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(offsets)} are kept: see wanted().")
+            raise ValueError(f"append() got tokens of {len(tokens)} frames, expected {len(offsets)}: see to_encode().")
         self._score(frames, numbers)
         if len(tokens):
             self._grow(len(self._stored_frames) + len(tokens), tokens)

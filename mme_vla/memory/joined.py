@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, require
 from mme_vla.memory.base import (
+    NEVER,
     CacheMemory,
     CompilableMemory,
     MemoryModule,
@@ -265,22 +266,23 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
-    """What has to be stored so that every one of these memories finds what it wants."""
-    (first, one), *_ = specs.items()
-    for name, other in specs.items():
+    """What has to be stored so that every one of these memories finds what it wants; some store nothing."""
+    stored = {name: spec for name, spec in specs.items() if spec.keep_every != NEVER} or dict(specs)
+    (first, one), *_ = stored.items()
+    for name, other in stored.items():
         require(
             other.pooling == one.pooling,
             f"{first} stores {one} and {name} {other}: one history pools in one way. Set the same "
             f"pooling for both, such as {{name: {name}, pooling: {one.pooling}}}.",
         )
-    scorers = {name: spec.scorer for name, spec in specs.items() if spec.scorer}
+    scorers = {name: spec.scorer for name, spec in stored.items() if spec.scorer}
     if len(set(scorers.values())) > 1:
         raise UserError(
             f"{' and '.join(scorers)} score frames differently ({', '.join(scorers.values())}), and one history keeps "
             "one set of scores: set the same grid and stride for both, or join only one of them."
         )
-    grid = math.lcm(*(spec.grid for spec in specs.values()))
-    every = math.gcd(*(spec.keep_every for spec in specs.values()))
+    grid = math.lcm(*(spec.grid for spec in stored.values()))
+    every = math.gcd(*(spec.keep_every for spec in stored.values()))
     return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
 
 

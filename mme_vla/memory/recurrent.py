@@ -103,8 +103,8 @@ class Taken:
 class RecurrentStream:
     """How far one episode's recurrence has come.
 
-    kept: the last used is the last one. updates: frames taken since the episode began, repeated ones included.
-    asked: the step of the last decision. pace: frames from the decision before it to that one.
+    snapshots: the last used is the last one. updates: frames taken since the episode began, repeated ones included.
+    last_step: that of the last decision. pace: frames from the decision before it to that one.
     """
 
     snapshots: list[Taken] = field(default_factory=list)

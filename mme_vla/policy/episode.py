@@ -134,6 +134,8 @@ class Episode:
             for i in recent
             if i == count - 1 or not demo[i]
         ]
+        if not self._video_over and not demo[-1]:
+            self._recent = []  # frames of the video are not in a window of the execution
         self._take(views[self._robot.memory_camera], demo, executed, states)
         if self._past is not None:
             self._past.take(views)

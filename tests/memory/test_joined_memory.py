@@ -73,6 +73,12 @@ def test_budgets_are_shared_evenly_or_as_configured() -> None:
     assert [m.budget for m in joined(["framesamp", "ttt"]).memories] == [256, 256]
     assert [m.budget for m in joined(["framesamp", "ttt", "rmt"]).memories] == [160, 160, 160]
     assert [m.budget for m in joined([{**FRAMES, "budget": 128}, "ttt"], 256).memories] == [128, 128]
+    assert [m.budget for m in joined(["framesamp", {"name": "present", "grid": 2}]).memories] == [256, 4]
+
+
+def test_members_that_store_nothing_ask_nothing_of_the_storage() -> None:
+    stored = joined([{**FRAMES, "grid": 2, "every": 3, "pooling": "max"}, {"name": "actions", "budget": 16}]).storage
+    assert (stored.grid, stored.pooling, stored.keep_every) == (2, "max", 3)
 
 
 @pytest.mark.parametrize(
@@ -85,6 +91,9 @@ def test_budgets_are_shared_evenly_or_as_configured() -> None:
         ([FRAMES, {**TTT, "pooling": "max"}], r"(?s)framesamp stores.*mean.*ttt.*max.*Set the same pooling"),
         (["tokendrop", {"name": "tokendrop", "stride": 4}], "the same grid and stride"),
         (["framesamp", "tttt"], "ttt"),
+        ([{**FRAMES, "gird": 4}, TTT], r"unexpected keyword argument 'gird'.*Did you mean 'grid'"),
+        ([{**FRAMES, "every": 7.5}, TTT], "every 7.5th frame"),
+        ([{**FRAMES, "grid": 0}, TTT], "memory.grid=0 must be at least 1"),
     ],
 )
 def test_what_cannot_be_joined_is_reported(members: list[Any], words: str) -> None:

@@ -40,7 +40,7 @@ class MotionRows(History):
     """A history as such a memory sees it: its tokens are rows, padded with zeros to the width of a token.
 
     Args:
-        whole: what is there. read: frames [n] → rows [n, w] float32. width: of a token.
+        source: what is there. read: frames [n] → rows [n, w] float32. width: of a token.
         memory: its name, for what is said where a row is too long. device: where rows are wanted; None leaves them.
     """
 

@@ -1,6 +1,5 @@
 """A small pre-norm transformer block that memories put together: some tokens read others, then an MLP."""
 
-from abc import abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
@@ -64,9 +63,9 @@ def rows_at(x: Tensor, at: Tensor) -> Tensor:
 class FrameMemory(MemoryModule):
     """A subclass says which frames; all tokens of these are selected, and as many as there are."""
 
-    @abstractmethod
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames that are read at `step` of an episode whose execution begins at `exec_start`; int64, ascending."""
+        raise NotImplementedError
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return union_frames([self.selected_frames(int(step), exec_start) for step in steps])

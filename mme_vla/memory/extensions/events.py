@@ -74,6 +74,11 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
     def top_frames(self, history: History, frames: np.ndarray) -> np.ndarray:
         """Which of the stored frames [n] up to now are kept: ascending indices, no more than fit."""
         states = history.proprio(frames).numpy().astype(np.float64)
+        count, number = states.shape[1], self.gripper_state
+        require(
+            -count <= number < count,
+            f"memory.gripper_state={number}: the robot's state has {count} numbers, counted from 0. Name the gripper's.",
+        )
         arm, gripper = np.delete(states, self.gripper_state, 1), states[:, self.gripper_state]
         closes = np.abs(np.diff(gripper, prepend=gripper[:1])) >= self.gripper
         speed = np.linalg.norm(np.diff(arm, axis=0, prepend=arm[:1]), axis=1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.errors import check_sizes, require
 from mme_vla.memory.base import PerceptualMemory, all_patches, union_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
@@ -19,8 +20,24 @@ class Present(PerceptualMemory):
 
     lazy = True
 
-    def __init__(self, d_vision: int, width: int, grid: int = 4, pooling: str = "mean", **encoder: Any) -> None:
-        """See `PerceptualMemory`. grid, pooling: the current frame is grid×grid tokens."""
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        grid: int = 4,
+        pooling: str = "mean",
+        budget: int | None = None,
+        **encoder: Any,
+    ) -> None:
+        """See `PerceptualMemory`.
+
+        Args:
+            grid, pooling: the current frame is grid×grid tokens.
+            budget: most memory tokens there is room for; None for as many as there are.
+        """
+        check_sizes("memory", grid=grid)
+        enough = budget is None or budget >= grid**2
+        require(enough, f"memory.budget={budget} does not hold the {grid}×{grid} tokens of a frame: {grid**2}.")
         super().__init__(d_vision, width, grid**2, StorageSpec(grid, pooling), **encoder)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from mme_vla import Policy, UserError, build_policy, load_weights
 from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.sources import open_sources
 from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import moving_frames, unit_stats
@@ -60,7 +61,11 @@ def test_an_episode_sees_what_training_shows() -> None:
     policy = ready("diffusion_policy_obs2")
     (source,) = open_sources(["sample"], policy.embodiment)
     data = TrainingDataset([source], policy.require_processor())
-    item = data[5]
+    for index in (5, 0):  # the first step of an episode with a video has no frame before it
+        check_window(policy, source, data[index])
+
+
+def check_window(policy: DiffusionPolicy, source: EpisodeSource, item: dict[str, Any]) -> None:
     _, number, frame = item["place"]
     start = int(source.exec_starts[number])
     frames = np.arange(start, frame + 1)
@@ -84,6 +89,10 @@ def test_the_window_holds_consecutive_frames_or_those_it_was_requested_at() -> N
         episode.observe({name: of[:3] for name, of in images.items()}, states[:3], np.array([True, True, False]))
         first = episode.window[1]
         assert torch.equal(first[0], first[1]), "the video is no part of it: the first frame means those before"
+        in_pieces = policy.start_episode("push the button")
+        for frame, demo in enumerate((True, True, False)):
+            in_pieces.observe({name: of[frame : frame + 1] for name, of in images.items()}, states[[frame]], demo)
+        assert torch.equal(in_pieces.window[1], first), "however it is observed"
         episode.observe({name: of[3:] for name, of in images.items()}, states[3:])
         batches[consecutive] = episode.window[1][:, 0].tolist()
     assert batches == {True: [states[7, 0], states[8, 0]], False: [states[2, 0], states[8, 0]]}
