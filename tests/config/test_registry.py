@@ -16,5 +16,5 @@ def test_a_name_that_ships_is_not_taken_before_it_is_used() -> None:
 
 
 def test_a_name_is_taken_once() -> None:
-    with pytest.raises(UserError, match="ships with the library|already registered"):
+    with pytest.raises(UserError, match=r"ships with the library|already registered"):
         register("memory", "tokendrop")(type("Mine", (), {}))

@@ -77,7 +77,7 @@ class Events(PerceptualMemory, ScoringMemory, ProprioMemory):
         count, number = states.shape[1], self.gripper_state
         require(
             -count <= number < count,
-            f"memory.gripper_state={number}: the robot's state has {count} numbers, counted from 0. Name the gripper's.",
+            f"memory.gripper_state={number}: the robot's state has {count} numbers. Name the gripper's, from 0.",
         )
         arm, gripper = np.delete(states, self.gripper_state, 1), states[:, self.gripper_state]
         closes = np.abs(np.diff(gripper, prepend=gripper[:1])) >= self.gripper
