@@ -74,14 +74,14 @@ class Registry[T]:
         what = f"{self.kind} {section['name']!r}"
         if twice := sorted(set(options) & set(fixed)):
             raise UserError(f"{what}: {twice[0]} is not an option; it follows from the other parts.")
-        accepted, open_ended = _keywords(entry)
-        takes = [name for name in accepted if name not in fixed][len(args) :]
-        unknown = [] if open_ended else [name for name in options if name not in takes]
+        signature = inspect.signature(entry)
         try:
-            inspect.signature(entry).bind(*args, **fixed, **options)
-            if unknown:
-                raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}")
+            signature.bind(*args, **fixed, **options)
         except TypeError as error:
+            kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+            accepted = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
+            takes = accepted[len(args) :]
+            unknown = [name for name in options if name not in takes]
             hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
             options_text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
             raise UserError(f"{what} does not take these options: {options_text} ({error}). {hint}") from None
@@ -92,24 +92,6 @@ class Registry[T]:
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted({*self._entries, *self._shipped}))
-
-
-def _keywords(entry: Any) -> tuple[list[str], bool]:
-    """Names of the arguments that a constructor takes, and whether it takes any others.
-
-    A class that passes `**options` on to its base takes those of the base.
-    """
-    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-    makers = (
-        [vars(c)["__init__"] for c in entry.__mro__ if "__init__" in vars(c)] if inspect.isclass(entry) else [entry]
-    )
-    names: dict[str, None] = {}
-    for make in makers:
-        parameters = inspect.signature(make).parameters.values()
-        names |= {p.name: None for p in parameters if p.kind in kinds and p.name != "self"}
-        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-            return list(names), False
-    return list(names), True
 
 
 MEMORIES: Registry[Any] = Registry(
