@@ -262,6 +262,7 @@ def _rerun(args: argparse.Namespace) -> "Iterator[RerunLog | None]":
 
 def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]":
     """The policy, the episodes it replays, and its name."""
+    from mme_vla.config.devices import find_device
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -269,14 +270,15 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
 
     if (args.checkpoint is None) == (args.model is None):
         raise UserError("Name one policy: --checkpoint FOLDER, or --model NAME for one with fresh weights.")
+    device = find_device(args.device)
     if args.checkpoint is not None:
         policy = MMEPolicy.from_pretrained(
-            resolve_checkpoint(args.checkpoint), device=args.device, trust_plugins=args.trust_plugins
+            resolve_checkpoint(args.checkpoint), device=device, trust_plugins=args.trust_plugins
         )
         name = safe_name(str(policy.config.get("name") or args.checkpoint.name), "the policy's name")
         return policy, EpisodeSource(args.dataset, robot=policy.embodiment), name
     print(f"{args.model} with fresh weights: what it shows is where a model starts, not what one learns.")
-    policy = mme_of(build_policy(args.model, backbone=args.backbone, device=args.device), "This analysis")
+    policy = mme_of(build_policy(args.model, backbone=args.backbone, device=device), "This analysis")
     return policy, EpisodeSource(args.dataset), args.model
 
 

@@ -2,7 +2,6 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -10,9 +9,6 @@ from mme_vla.cli.command import cli
 from mme_vla.config.devices import own_device
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock
-
-if TYPE_CHECKING:
-    pass
 
 
 @cli("cache")

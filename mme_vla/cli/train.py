@@ -37,10 +37,19 @@ def main(cfg: DictConfig) -> None:
             train(cfg, config, fresh, begun, named)
         else:
             train_several(cfg, fresh, config["trainings"])
+        end_processes()
     except UserError:
         with suppress(OSError):
             fresh.rmdir()  # Hydra made it; it stays if it holds anything
         raise
+
+
+def end_processes() -> None:
+    """Leave the group of processes that trained together, if there is one."""
+    import torch.distributed as distributed
+
+    if distributed.is_available() and distributed.is_initialized():
+        distributed.destroy_process_group()
 
 
 def train_several(cfg: DictConfig, folder: Path, count: Any) -> list[Path]:
@@ -202,7 +211,6 @@ def _train(
             finish(trainer, data, time.perf_counter() - begun, line, loggers)
     finally:
         loggers.close()
-    accelerator.end_training()
     return trainer
 
 

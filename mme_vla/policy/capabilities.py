@@ -194,7 +194,7 @@ class WritableMemory(Protocol):
 
     @property
     def memory_clock(self) -> str | None:
-        """Unit of the entries' times (`moments`); None if entries only have an order."""
+        """Unit of the entries' times (`frames`); None if entries only have an order."""
         ...
 
     def writable_memory(self) -> tuple[MemoryEntries, ...]:

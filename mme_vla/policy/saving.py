@@ -65,7 +65,7 @@ def policy_class(config: Mapping[str, Any]) -> type[Any]:
 
 
 def policy_class_for[P](requested: type[P], config: Mapping[str, Any], source: str) -> type[P]:
-    """The class to load a checkpoint with, where `asked.from_pretrained` was called."""
+    """The class to load a checkpoint with, where `requested.from_pretrained` was called."""
     kind = policy_class(config)
     if issubclass(requested, kind):
         return requested

@@ -11,6 +11,8 @@ from mme_vla.utils import Sums
 
 KEY = "training"
 """The section of a checkpoint's configuration that holds the identity of its training."""
+FRESH = "none"
+"""What `init_from` says for random weights."""
 _RECIPE = ("train", "finetune", "learning", "init_from")
 _POLICY = ("augment", "compute_dtype")
 _DATA = ("action_offset", "mask_padding", "jitter", "history_transforms")
@@ -45,8 +47,8 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
         "policy": {key: (config.get("policy") or {}).get(key) for key in _POLICY},
         "data": {key: data.get(key) for key in _DATA},
     }
-    if settings["init_from"] is not None:
-        settings["init_from"] = _start(str(settings["init_from"]))
+    start = settings["init_from"]
+    settings["init_from"] = None if start in (None, FRESH) else _start(str(start))
     recipe = {
         key: value
         for key, value in flat(settings).items()
@@ -68,10 +70,14 @@ def weights_digest(folder: Path) -> str | None:
     from mme_vla.policy.tensor_files import list_weight_files  # PyTorch, which results do without
 
     table = Sums(folder).table
+    if not table:
+        return None
     sums = [table[name] for name in sorted(list_weight_files(folder)) if name in table]
     return digest({"weights": sums}, 12) if sums else None
 
 
 def _start(source: str) -> str:
-    """What weights to start from are called in a recipe: their digest, or the end of their path."""
-    return weights_digest(Path(source)) or Path(source).name
+    """What weights to start from are called in a recipe: their digest, or the end of their path or hub name."""
+    from mme_vla.policy.run_folders import newest_checkpoint
+
+    return weights_digest(newest_checkpoint(Path(source).expanduser())) or Path(source).name

@@ -40,7 +40,7 @@ def begins(request: Request) -> bool:
 class Session:
     """The episode of one client.
 
-    Requests of a session must come one after the other; `answer` is not to be called twice at the same time.
+    Requests of a session must come one after the other; `respond` is not to be called twice at the same time.
     """
 
     def __init__(self, engine: Engine, settings: ServeSettings) -> None:

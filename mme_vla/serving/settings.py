@@ -61,7 +61,7 @@ class ServeSettings:
     port: Annotated[int, Range(0, 65535)] = 8001
     api_key: str | None = field(default=None, repr=False)
     require_key: bool = False
-    action_space: Literal["joint_angle", "ee_pose", "waypoint", "ee_delta"] | None = None
+    action_space: Literal["joint_angle", "ee_pose", "waypoint", "ee_delta", "multi_choice"] | None = None
     execute: PositiveInt | None = None
     flow_steps: PositiveInt | None = None
     seed: int = 42

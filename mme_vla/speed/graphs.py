@@ -43,10 +43,6 @@ class GraphSampler:
         """Sizes captured so far."""
         return len(self._captured)
 
-    def forget(self) -> None:
-        """Drop all graphs: what they were captured from has changed."""
-        self._captured.clear()
-
     @torch.no_grad()
     def __call__(self, inputs: Inputs) -> Tensor:
         """The chunks [b, h, a] of a batch, on the GPU."""

@@ -68,7 +68,7 @@ class SubgoalEpisode:
     video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
     frame: the current front image [H, W, 3] uint8. step: actions executed so far.
     info: what the environment reports beside the image. subgoal: the last prediction.
-    asked_step: the step of the last question; None while there was none.
+    query_step: the step of the last question; None while there was none.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None = None, task: str = "") -> None:
@@ -113,7 +113,7 @@ class SubgoalEpisode:
 
 
 class SubgoalPredictor:
-    """The interface of every predictor. A subclass implements `answer`, and overrides the rest where it needs to.
+    """The interface of every predictor. A subclass implements `predict_due`, and overrides the rest where it needs to.
 
     Args:
         kind: `simple` (words alone) or `grounded` (with points).

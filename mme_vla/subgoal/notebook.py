@@ -101,7 +101,7 @@ class Identity:
     words: str
 
     def check(self, before: "Identity | None", finished: bool) -> None:
-        """See `Notebook.written`: things are moved, so that other words may tell them."""
+        """See `Notebook.with_entries`: things are moved, so that other words may tell them."""
 
 
 @dataclass(frozen=True)

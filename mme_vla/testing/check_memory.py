@@ -178,7 +178,7 @@ def check_encoding(memory: Memory, frames: int) -> None:
 
 @torch.no_grad()
 def check_streaming(memory: Memory, frames: int) -> None:
-    """`remember`: an episode that grows gives the tokens of the complete one."""
+    """`encode_histories`: an episode that grows gives the tokens of the complete one."""
     first, second = Episode(memory, frames, seed=1), Episode(memory, frames, seed=2)
     histories = [first.online(16, 16), second.online(16, 16)]
     streams = [start_stream(memory) for _ in histories]

@@ -59,7 +59,7 @@ class VideoWriter:
         self.frames += 1
 
     def close(self, complete: bool = True) -> None:
-        """End the video; with `whole=False` what the encoder still holds is dropped, for a file that is thrown away."""
+        """End the video; with `complete=False` what the encoder still holds is dropped, for a file that is removed."""
         if complete and self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._container.close()

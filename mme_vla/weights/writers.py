@@ -169,7 +169,7 @@ def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: Norm
     policy = mme_of(policy, "The released layout")
     names = {target: released for released, target in VARIANTS.items()}
     variant = names.get(str(policy.config.get("name")))
-    if policy.memory is not None and variant is not None:
+    if variant is not None and policy.config.get("name") != "pi05":
         (folder / "history_config.txt").write_text(f"{variant}.yaml\n")
     write_orbax({name: cast(tensor, dtype) for name, tensor in to_released(policy).items()}, folder / "0" / "params")
     _write_assets(folder / "0", stats)

@@ -17,6 +17,7 @@ from mme_vla.evaluation.results.tables import leaderboard, overview, runs_table
 from mme_vla.evaluation.rollout.evaluation import facts_of
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
+from mme_vla.policy.run_folders import STATE
 from mme_vla.policy.training_identity import KEY, TrainingIdentity, identify
 
 PROTOCOL = Protocol(("StopCube",), 10, samples=500)
@@ -89,6 +90,20 @@ def test_the_recipe_holds_what_changes_an_update() -> None:
     longer = {**CONFIG, "train": {**CONFIG["train"], "steps": 400}}
     assert identify(longer, ["abc"])["recipe"] != base["recipe"]
     assert identify(CONFIG, ["xyz"])["data"] != base["data"]
+    started = {start: identify({**CONFIG, "init_from": start}, ["abc"])["recipe"] for start in
+               (None, "none", "lerobot/pi05_base", "/not/here/pi05_base")}  # fmt: skip
+    assert started[None] == started["none"] == base["recipe"], "random weights"
+    assert started["lerobot/pi05_base"] == started["/not/here/pi05_base"] != base["recipe"], "the end of a path"
+
+
+def test_a_recipe_names_the_weights_that_it_starts_from(tmp_path: Path) -> None:
+    checkpoint = tmp_path / "run" / "checkpoints" / "step_000010"
+    quick_policy("pi05").save_pretrained(checkpoint)
+    (checkpoint / STATE).write_text("{}")
+    recipes = {
+        identify({**CONFIG, "init_from": str(place)}, ["abc"])["recipe"] for place in (tmp_path / "run", checkpoint)
+    }
+    assert len(recipes) == 1
 
 
 def test_records_copy_the_training_of_a_checkpoint(tmp_path: Path) -> None:

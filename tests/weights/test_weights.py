@@ -108,7 +108,7 @@ def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path
         start_from(build_policy("framesamp_modul"), tmp_path)
 
 
-@pytest.mark.parametrize("variant", ["pi05", *PERCEPTUAL])
+@pytest.mark.parametrize("variant", ["pi05", "simplesg", "groundsg", *PERCEPTUAL])
 def test_conversion_there_and_back_keeps_every_bit(variant: str, tmp_path: Path) -> None:
     policy = small_policy(variant)
     policy.save_pretrained(tmp_path / "ours")
@@ -118,6 +118,7 @@ def test_conversion_there_and_back_keeps_every_bit(variant: str, tmp_path: Path)
     first, last = tmp_path / "ours", tmp_path / "back"
     assert (first / "model.safetensors").read_bytes() == (last / "model.safetensors").read_bytes()
     back, batch = MMEPolicy.from_pretrained(last), random_batch(policy)
+    assert back.config["name"] == policy.config["name"]
     noise = torch.zeros_like(batch.actions)
     assert torch.equal(back.sample_actions(batch, noise), policy.sample_actions(batch, noise))
     assert back.require_processor().stats is not None

@@ -257,7 +257,7 @@ def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledI
     if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
         raise UserError(
             f"Diffusion Policy has no place for what the integration {section['name']!r} brings: memory reaches it as "
-            "one vector. Choose integration=video."
+            "one vector. Choose integration=film."
         )
     built: PooledIntegration = INTEGRATIONS.build(section, sizes)
     return built

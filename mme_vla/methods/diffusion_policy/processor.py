@@ -100,7 +100,7 @@ class DiffusionProcessor(GoalProcessor):
         """Put it together.
 
         Args:
-            image: (height, width) of the images before cropping; images of this size are left as they are.
+            picture: (height, width) of the images before cropping; images of this size are left as they are.
             text: `clip`, `hashed`, or the folder of a CLIP. text_dim: width of its vectors.
             window: frames of an observation. frames: `consecutive`, or `asked`: those at which the policy was asked.
             memory_size: side of the images that a memory's vision tower reads.

@@ -51,7 +51,7 @@ class SAM2ActSizes:
 
     grid, patch: patches of a virtual image, and their side in pixels; an image has grid · patch of them.
     width, heads, depth: of the multi-view transformer. language, words: width and number of the goal's tokens.
-    sam, images, state: what of a token's width the encoder's map, the image and the robot's state take.
+    sam, pictures, state: what of a token's width the encoder's map, the image and the robot's state take.
     state_dim: numbers of the robot's state. rotation_bins: of a whole turn. head: first width of the heads.
     memory: width of a remembered place; memory_layers, memory_feedforward: of the attention over memories.
     mask_stages: halvings between a heatmap's image and the grid. remembered: most keyframes that are read.
@@ -85,8 +85,8 @@ class SAM2ActSizes:
     def __post_init__(self) -> None:
         check_multiple("backbone.", "width", self.width, "backbone.heads", self.heads)
         check_multiple("backbone.", "depth", self.depth, "pairs", 2)  # half of the layers see one view alone
-        for name in ("token", "memory"):
-            check_multiple("backbone.encoder.", name, getattr(self, name), "quarters", 4)
+        check_multiple("backbone.", "memory", self.memory, "quarters", 4)
+        check_multiple("backbone.", "sam + backbone.pictures + backbone.state", self.token, "quarters", 4)
         require(360 % self.rotation_bins == 0, f"backbone.rotation_bins={self.rotation_bins} must divide 360 degrees.")
 
     @property

@@ -65,7 +65,7 @@ _WIDER = 4  # feed-forward layers, inside
 class EncodedViews:
     """The network's encoding of one view of the scene.
 
-    images: [b, 3, 10, s, s] of `virtual_pictures`. maps: of the image encoder for all views, finest first:
+    images: [b, 3, 10, s, s] of `virtual_images`. maps: of the image encoder for all views, finest first:
     [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p]. language: [b, l, w].
     """
 

@@ -157,7 +157,7 @@ class SAM2ActPolicy(NetworkPolicy):
             processor, config, options: of `NetworkPolicy`. The authors train in float16.
         """
         super().__init__(processor, config, **options)
-        check_choice("stage", stage, STAGES)
+        check_choice("policy.stage", stage, STAGES)
         self.backbone, self.stage = backbone, stage
         self.horizon, self.action_dim = 1, WIDTH
         # Single keyframes first, then one more than can be remembered.

@@ -10,16 +10,13 @@ from functools import lru_cache
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from mme_vla.errors import UserError, brief, missing_extra
 from mme_vla.methods.simplememvla.video import timestamp
 from mme_vla.processing.tokenizer import HUB
-
-if TYPE_CHECKING:
-    pass
 
 BYTES, WORDS = "bytes", "words"
 QWEN = f"{HUB}Qwen/Qwen3.5-4B/tokenizer.json"

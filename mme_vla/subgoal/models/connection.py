@@ -16,7 +16,7 @@ from mme_vla.subgoal.clips import ENCODING, sample_video
 from mme_vla.utils.media import png_bytes, video_bytes
 
 Message = tuple[str, list[Any]]
-"""Role (`user` or `model`); parts: texts, images [H, W, 3], videos [t, H, W, 3], bare or as `Shown`."""
+"""Role (`user` or `model`); parts: texts, images [H, W, 3], videos [t, H, W, 3], bare or as `MediaPart`."""
 
 
 @dataclass(frozen=True)

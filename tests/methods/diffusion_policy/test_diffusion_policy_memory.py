@@ -106,7 +106,7 @@ def test_its_tower_stays_as_it_is_and_the_cameras_encoder_learns(policy: Diffusi
 
 
 def test_what_does_not_fit_is_reported() -> None:
-    with pytest.raises(UserError, match=r"one vector\. Choose integration=video"):
+    with pytest.raises(UserError, match=r"one vector\. Choose integration=film"):
         build_policy("diffusion_policy", memory="framesamp", integration="modulator")
     with pytest.raises(UserError, match="name both, or neither"):
         build_policy("diffusion_policy", integration="film")
