@@ -41,10 +41,10 @@ class Registry[T]:
                 ),
                 f"{self.kind} {name!r} is already registered by {taken!r}; choose another name.",
             )
-            home = self._shipped.get(name)
+            module = self._shipped.get(name)
             require(
-                taken is not None or home in (None, getattr(entry, "__module__", None)),
-                f"{self.kind} {name!r} ships with the library ({home}); choose another name.",
+                taken is not None or module in (None, getattr(entry, "__module__", None)),
+                f"{self.kind} {name!r} ships with the library ({module}); choose another name.",
             )
             self._entries[name] = entry
             return entry

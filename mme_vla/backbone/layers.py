@@ -55,13 +55,10 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
 
     Of positions [b, n, k] the angles use the coordinates in turn.
     """
-    exponent = torch.arange(head_dim // 2, device=positions.device, dtype=torch.float32) * (2 / head_dim)
+    pairs = torch.arange(head_dim // 2, device=positions.device)
+    exponent = pairs.float() * (2 / head_dim)
     several = positions.ndim == 3
-    places = (
-        positions[..., torch.arange(head_dim // 2, device=positions.device) % positions.shape[-1]]
-        if several
-        else positions[..., None]
-    )
+    places = positions[..., pairs % positions.shape[-1]] if several else positions[..., None]
     angles = (places[:, :, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
     return Rotation(angles.cos(), angles.sin())
 

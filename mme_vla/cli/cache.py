@@ -6,7 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.cli.command import cli
-from mme_vla.config.devices import own_device
+from mme_vla.config.devices import process_device
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock
 
@@ -27,7 +27,7 @@ def main(cfg: DictConfig) -> None:
     policy = build_from_config(cfg, fresh_backbone=init_from is None)
     if init_from is not None:
         print(start_from(policy, init_from))
-    device = own_device(cfg.device)
+    device = process_device(cfg.device)
     memory = policy.to(device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")

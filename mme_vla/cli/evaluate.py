@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
 from mme_vla.config.composition import resolved
-from mme_vla.config.devices import own_device
+from mme_vla.config.devices import process_device
 from mme_vla.errors import check_choice
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ def evaluate_one(cfg: DictConfig, training: str = "") -> None:
     shard = choose_shard(values["shard"])
     environment(settings.env).check_installed()
     log_to_terminal(logger)
-    device = own_device(str(cfg.device))
+    device = process_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
     prepare_sampling(policy, cfg.sampling, logger)
     sessions = values["recordings"]

@@ -10,7 +10,7 @@ from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import resolved
-from mme_vla.config.devices import own_device
+from mme_vla.config.devices import process_device
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, require
 
@@ -61,7 +61,7 @@ def probe(cfg: DictConfig) -> None:
     if jobs:
         environment(settings.env).check_installed()
     log_to_terminal(logger)
-    device = own_device(str(cfg.device))
+    device = process_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
     data = values["recordings"]
     recordings = [] if data is None else all_recordings(open_sources(data, policy.embodiment))

@@ -148,9 +148,9 @@ def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None
     curves = ood.extrapolation(*how)
     tables = [*ood.tier_tables(*how), ood.hard_table(*how), ood.twin_table(*how), ood.extrapolation_table(curves)]
     caption = "All splits of a run together; the training range is shaded."
-    shown = [table for table in tables if table]
-    require(shown, "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an amount.")
-    show_tables(shown, ood.extrapolation_figures(curves), caption, args)
+    filled = [table for table in tables if table]
+    require(filled, "None of these records is of RoboMME-OOD, the hard test episodes or a twin, or has an amount.")
+    show_tables(filled, ood.extrapolation_figures(curves), caption, args)
 
 
 def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace) -> None:

@@ -37,19 +37,14 @@ def main(cfg: DictConfig) -> None:
             train(cfg, config, fresh, begun, named)
         else:
             train_several(cfg, fresh, config["trainings"])
-        end_processes()
+        from torch import distributed
+
+        if distributed.is_available() and distributed.is_initialized():  # all trainings share the group
+            distributed.destroy_process_group()
     except UserError:
         with suppress(OSError):
             fresh.rmdir()  # Hydra made it; it stays if it holds anything
         raise
-
-
-def end_processes() -> None:
-    """Leave the group of processes that trained together, if there is one."""
-    import torch.distributed as distributed
-
-    if distributed.is_available() and distributed.is_initialized():
-        distributed.destroy_process_group()
 
 
 def train_several(cfg: DictConfig, folder: Path, count: Any) -> list[Path]:

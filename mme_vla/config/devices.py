@@ -34,7 +34,7 @@ def find_device(name: str) -> "torch.device":
     return device
 
 
-def own_device(name: str) -> "torch.device":
+def process_device(name: str) -> "torch.device":
     """The device of that name; `auto` and `cuda` are a GPU of its own for each of a machine's processes (torchrun)."""
     import torch
 

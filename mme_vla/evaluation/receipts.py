@@ -65,8 +65,8 @@ def receipt(records: Path, policy: Policy, run: Mapping[str, Any], source: str |
 def read_receipt(path: Path) -> dict[str, Any]:
     """Read a receipt."""
     content: dict[str, Any] = verified(read_json(path, "a receipt"), str(path))
-    lacking = [key for key in ("settings", "conditions", "records", "scenes", "score") if key not in content]
-    require(not lacking, f"{path} is no receipt of an evaluation: it has no {', '.join(lacking)}.")
+    missing = [key for key in ("settings", "conditions", "records", "scenes", "score") if key not in content]
+    require(not missing, f"{path} is no receipt of an evaluation: it has no {', '.join(missing)}.")
     return content
 
 
@@ -92,10 +92,10 @@ def verify(path: Path, checkpoint: Path | None = None) -> tuple[list[str], list[
         score = to_json(_score(records, settings))
         for key in ("records", "score", "scenes"):
             differences += _differences(key, content[key], score[key])
-        try:
+        if why := _unknown_scenes(read_records(records), settings):
+            notes.append(f"scenes: not compared. {why}")
+        else:
             differences += _other_scenes(read_records(records), settings)
-        except UserError as error:  # an environment or a task of a plugin that is not loaded here
-            notes.append(f"scenes: not compared. {error}")
     else:
         differences.append(f"records: {content['records']['file']} is not beside the receipt, nor {records.name}.")
     for part in content["conditions"]:
@@ -137,6 +137,17 @@ def _scenes(records: Iterable[EpisodeRecord], split: str) -> str:
     """Digest of what makes the scenes: task, number, seed and difficulty; and the file of a split that is one."""
     scenes: dict[str, Any] = {f"{r.task} {r.episode}": [r.seed, r.difficulty] for r in records}
     return digest({"split": file_sum(Path(split)) if Path(split).is_file() else split, "scenes": scenes}, 64)
+
+
+def _unknown_scenes(records: Iterable[EpisodeRecord], settings: Mapping[str, Any]) -> str | None:
+    """Why there are no scenes here to compare with: an environment or a task of a plugin that is not loaded."""
+    try:
+        env = environment(settings["env"])
+        for task in {record.task for record in records}:
+            env.check_task(task)
+    except UserError as error:
+        return str(error)
+    return None
 
 
 def _other_scenes(records: Iterable[EpisodeRecord], settings: Mapping[str, Any]) -> list[str]:

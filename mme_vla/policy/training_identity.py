@@ -11,7 +11,7 @@ from mme_vla.utils import Sums
 
 KEY = "training"
 """The section of a checkpoint's configuration that holds the identity of its training."""
-FRESH = "none"
+NONE = "none"
 """What `init_from` says for random weights."""
 _RECIPE = ("train", "finetune", "learning", "init_from")
 _POLICY = ("augment", "compute_dtype")
@@ -48,7 +48,7 @@ def identify(config: Mapping[str, Any], content: Sequence[str]) -> dict[str, Any
         "data": {key: data.get(key) for key in _DATA},
     }
     start = settings["init_from"]
-    settings["init_from"] = None if start in (None, FRESH) else _start(str(start))
+    settings["init_from"] = None if start in (None, NONE) else _start(str(start))
     recipe = {
         key: value
         for key, value in flat(settings).items()

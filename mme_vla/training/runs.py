@@ -21,7 +21,7 @@ from mme_vla.policy.run_folders import (
     trainings_in,
 )
 from mme_vla.policy.saving import policy_name
-from mme_vla.policy.training_identity import FRESH
+from mme_vla.policy.training_identity import NONE
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
@@ -222,7 +222,7 @@ def check_finished(trainings: Sequence[Path]) -> None:
     )
 
 
-ASK, NONE = "ask", FRESH
+ASK = "ask"
 
 
 def weights_to_start_from(init_from: str | None) -> str | None:

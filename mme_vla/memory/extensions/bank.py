@@ -290,25 +290,25 @@ class MemoryBank(Retrieval):
             return functional.cosine_similarity(entries_at(first), entries_at(second), dim=-1).mean(-1)
 
         places = torch.arange(self.length, device=times.device)[None]
-        held = places[:, : times.shape[1]].expand(len(times), -1)  # b k: which of the moments
-        alike = similarity(held[:, :-1], held[:, 1:])  # of neighbours; merging changes two of them
+        indices = places[:, : times.shape[1]].expand(len(times), -1)  # b k: which of the moments
+        alike = similarity(indices[:, :-1], indices[:, 1:])  # of neighbours; merging changes two of them
         for step in range(self.length, times.shape[1]):
-            held = torch.cat([held, torch.full_like(held[:, :1], step)], 1)
+            indices = torch.cat([indices, torch.full_like(indices[:, :1], step)], 1)
             # Where the first place is empty it goes; else the oldest does, or two neighbours become one.
-            pair = torch.full_like(held[:, :1], -1)
+            pair = torch.full_like(indices[:, :1], -1)
             if self.consolidation == "tome":
-                alike = torch.cat([alike, similarity(held[:, -2:-1], held[:, -1:])], 1)
-                pair = torch.where(valid.gather(1, held[:, :1]), alike.argmax(1, keepdim=True), pair)
-                both = entries_at(held.gather(1, torch.cat([pair, pair + 1], 1).clamp(min=0)))
+                alike = torch.cat([alike, similarity(indices[:, -2:-1], indices[:, -1:])], 1)
+                pair = torch.where(valid.gather(1, indices[:, :1]), alike.argmax(1, keepdim=True), pair)
+                both = entries_at(indices.gather(1, torch.cat([pair, pair + 1], 1).clamp(min=0)))
                 one = torch.where((pair < 0)[..., None, None], both[:, :1], both.mean(1, keepdim=True))
-                earlier = held.gather(1, pair.clamp(min=0))[..., None, None].expand_as(one)
+                earlier = indices.gather(1, pair.clamp(min=0))[..., None, None].expand_as(one)
                 entries.scatter_(1, earlier, one)
                 alike = alike.gather(1, places[:, :-1] + (places[:, :-1] >= pair).long())
-            held = held.gather(1, places + (places > pair).long())
+            indices = indices.gather(1, places + (places > pair).long())
             if self.consolidation == "tome" and self.length > 1:
                 left = torch.cat([pair - 1, pair], 1).clamp(0, self.length - 2)
-                alike = alike.scatter(1, left, similarity(held.gather(1, left), held.gather(1, left + 1)))
-        return entries_at(held), times.gather(1, held), valid.gather(1, held)
+                alike = alike.scatter(1, left, similarity(indices.gather(1, left), indices.gather(1, left + 1)))
+        return entries_at(indices), times.gather(1, indices), valid.gather(1, indices)
 
     def run(
         self, tokens: Tensor, times: Tensor, sequences: Sequence[Tensor], states: Sequence[BankState] | None = None
