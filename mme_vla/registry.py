@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -71,21 +72,33 @@ class Registry[T]:
         if not isinstance(section.get("name"), str):
             raise UserError(f"The section of the {self.kind} needs a name. {did_you_mean('', self)}")
         entry: Any = self[section["name"]]
-        what = f"{self.kind} {section['name']!r}"
         if twice := sorted(set(options) & set(fixed)):
-            raise UserError(f"{what}: {twice[0]} is not an option; it follows from the other parts.")
+            raise UserError(f"{self.kind} {section['name']!r}: {twice[0]} is not an option; it follows from the other parts.")
         signature = inspect.signature(entry)
         try:
             signature.bind(*args, **fixed, **options)
         except TypeError as error:
-            kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-            accepted = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
-            takes = accepted[len(args) :]
-            unknown = [name for name in options if name not in takes]
-            hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
-            options_text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
-            raise UserError(f"{what} does not take these options: {options_text} ({error}). {hint}") from None
-        return entry(*args, **fixed, **options)
+            raise self._refused(section, fixed, len(args), str(error)) from None
+        try:
+            return entry(*args, **fixed, **options)
+        except TypeError as error:  # a constructor that passes `**options` on is asked only when it is called
+            unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+            if unknown is None or unknown[1] not in options:
+                raise
+            raise self._refused(section, fixed, len(args), str(error)) from error
+
+    def _refused(self, section: Mapping[str, Any], fixed: Mapping[str, Any], given: int, why: str) -> UserError:
+        """The error about a section's options, with those that its constructor and the ones it passes them on to take."""
+        options = {key: value for key, value in section.items() if key != "name"}
+        entry: Any = self[section["name"]]
+        makers = [c.__init__ for c in inspect.getmro(entry)] if isinstance(entry, type) else [entry]
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        parameters = [p for maker in makers for p in inspect.signature(maker).parameters.values() if p.kind in kinds]
+        takes = [name for name in dict.fromkeys(p.name for p in parameters) if name not in (*fixed, "self")][given:]
+        unknown = [name for name in options if name not in takes]
+        hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
+        text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
+        return UserError(f"{self.kind} {section['name']!r} does not take these options: {text} ({why}). {hint}")
 
     def __contains__(self, name: object) -> bool:
         return name in self._entries or name in self._shipped

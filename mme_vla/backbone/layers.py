@@ -1,15 +1,14 @@
 """Layers that all experts share: float32 layers, rotary embedding, RMS norms, and attention by a visibility table."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from mme_vla.config.devices import fused_kernels
 from mme_vla.errors import check_choice, require
 
 Visibility = Mapping[str, frozenset[str] | set[str]]
@@ -279,9 +278,6 @@ BIG_NEGATIVE = -1e30
 ALIGNMENT = 8
 """Keys a row of the mask is padded to, as fused kernels want it: otherwise they copy the mask in every layer."""
 
-KERNELS = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
-"""On a GPU. cuDNN, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths (pytorch#196678)."""
-
 
 def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
     """[b, q, k] bool → [b, 1, q, k] of 0 and `BIG_NEGATIVE`, made once per forward and shared by all layers.
@@ -329,11 +325,6 @@ def select_rows(mask: AttentionMask, rows: Sequence[slice], dtype: torch.dtype) 
         return torch.cat([mask[:, :, at] for at in rows], 2)
     assert mask is not None
     return layout_mask(mask.layout.part(rows), dtype)
-
-
-def fused_kernels(x: Tensor) -> AbstractContextManager[object]:
-    """The context of every attention on a GPU: the kernels of `KERNELS` alone."""
-    return sdpa_kernel(KERNELS) if x.is_cuda else nullcontext()
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.config import VisionConfig
-from mme_vla.backbone.layers import compute_dtype, fused_kernels
+from mme_vla.backbone.layers import compute_dtype
+from mme_vla.config.devices import fused_kernels
 from mme_vla.errors import UserError, require
 
 

@@ -143,7 +143,7 @@ def _train(
     from mme_vla.policy.tensor_files import take_memory
     from mme_vla.policy.training_identity import KEY as TRAINING
     from mme_vla.policy.training_identity import identify
-    from mme_vla.training.checkpoint import check_disk, load_policy
+    from mme_vla.training.checkpoint import check_disk, load_policy, read_state
     from mme_vla.training.data import check_frozen, prepare_data
     from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
     from mme_vla.training.loop import Trainer, finish
@@ -184,6 +184,8 @@ def _train(
         data = prepare_data(policy, *of_run, encoder[0])
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
+        # A resumed command need not repeat it, and later checkpoints still name what the run began with.
+        cfg["init_from"] = config["init_from"] = read_state(run.checkpoint)["config"].get("init_from")
     config["data"]["content"] = data.content
     policy.config[TRAINING] = identify(config, data.content)
     check_disk(run.folder, policy, settings.keep, sharded)

@@ -240,7 +240,7 @@ class EpisodeSource:
         if self.robot.action.frames is None:
             return self._motions_of(episode).before(start, most)
         stop = start + offset
-        first = max(int(self.exec_starts[episode]), stop - most)
+        first = max(int(self.exec_starts[episode]) + offset, stop - most)
         if first >= stop:
             return np.zeros((0, self.robot.action.width), np.float32)
         return self.actions(episode, first, stop)

@@ -6,6 +6,7 @@ import sys
 import pytest
 
 from mme_vla import UserError, register
+from mme_vla.registry import Registry
 
 
 def test_a_name_that_ships_is_not_taken_before_it_is_used() -> None:
@@ -18,3 +19,23 @@ def test_a_name_that_ships_is_not_taken_before_it_is_used() -> None:
 def test_a_name_is_taken_once() -> None:
     with pytest.raises(UserError, match=r"ships with the library|already registered"):
         register("memory", "tokendrop")(type("Mine", (), {}))
+
+
+class Base:
+    def __init__(self, grid: int = 8) -> None:
+        if grid < 0:
+            raise TypeError("negative")
+
+
+class Named(Base):
+    def __init__(self, budget: int = 4, **options: int) -> None:
+        super().__init__(**options)
+
+
+def test_an_option_that_is_passed_on_is_named_where_no_constructor_takes_it() -> None:
+    parts: Registry[type] = Registry("part")
+    parts.register("named")(Named)
+    with pytest.raises(UserError, match=r"part 'named' does not take these options: gird=4 .*Did you mean 'grid'"):
+        parts.build({"name": "named", "gird": 4})
+    with pytest.raises(TypeError, match="negative"):
+        parts.build({"name": "named", "grid": -1})

@@ -89,6 +89,9 @@ def test_the_recipe_holds_what_changes_an_update() -> None:
     assert identify(free, ["abc"]) == base
     longer = {**CONFIG, "train": {**CONFIG["train"], "steps": 400}}
     assert identify(longer, ["abc"])["recipe"] != base["recipe"]
+    for section, key in (("policy", "stage"), ("policy", "subtask_weight"), ("data", "weights"), ("data", "texts")):
+        other = {**CONFIG, section: {**CONFIG.get(section, {}), key: "x"}}
+        assert identify(other, ["abc"])["recipe"] != base["recipe"], key
     assert identify(CONFIG, ["xyz"])["data"] != base["data"]
     started = {start: identify({**CONFIG, "init_from": start}, ["abc"])["recipe"] for start in
                (None, "none", "lerobot/pi05_base", "/not/here/pi05_base")}  # fmt: skip

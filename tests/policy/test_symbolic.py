@@ -98,6 +98,9 @@ def test_past_actions_of_training_are_the_ones_right_before_the_chunk(source):
     assert data.past_actions(data.step(0)).shape == (0, 8), "the video's actions are not the robot's own"
     assert np.array_equal(data.past_actions(data.step(3)), source.actions(0, start, start + 3))
     assert np.array_equal(data.past_actions(data.step(40)), source.actions(0, start + 24, start + 40))
+    later = TrainingDataset([source], policy.processor, action_offset=1)
+    assert later.past_actions(later.step(0)).shape == (0, 8), "no action comes before the first frame of the execution"
+    assert np.array_equal(later.past_actions(later.step(3)), source.actions(0, start + 1, start + 4))
     assert int(data[40]["prompt_mask"].sum()) < 640, "all 128 numbers fit"
     assert len(re.findall(r"\d+", words(policy, data[40]).split("Past actions:")[1])) == 128
 

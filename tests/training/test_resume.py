@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from helpers import commands
 from mme_vla import MMEPolicy, UserError
@@ -76,6 +77,15 @@ def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> No
     assert not (runs[0] / "unused").exists()
     resumed_run, straight_run = (json.loads((folder / "summary.json").read_text()) for folder in (killed, straight))
     assert resumed_run["open_loop"] == straight_run["open_loop"]
+
+
+@pytest.mark.slow
+def test_a_resumed_run_names_the_weights_that_it_began_with(runs: tuple[Path, str]) -> None:
+    base = runs[0]
+    words = [*SMALL, f"data.cache.root={base}", "train.save_every=1", f"output={base / 'tuned'}"]
+    main(compose("train", [*words, "train.steps=1", f"init_from={base / 'whole'}"]))
+    main(compose("train", [*words, "train.steps=2", f"resume={base / 'tuned'}"]))
+    assert OmegaConf.load(base / "tuned" / "config.yaml")["init_from"] == str(base / "whole")
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mme_vla.config.devices import fused_kernels
 from mme_vla.errors import require
 from mme_vla.memory.base import MemoryModule, all_patches, union_frames
 from mme_vla.memory.history import History
@@ -39,7 +40,8 @@ class ReadingBlock(nn.Module):
         q, k, v = (part.transpose(1, 2) for part in (q, k, v))
         # A row that may read nothing is padding: reading all keeps it finite.
         key_mask = (mask | ~mask.any(-1, keepdim=True))[:, None]
-        read = functional.scaled_dot_product_attention(q, k, v, attn_mask=key_mask)
+        with fused_kernels(q):
+            read = functional.scaled_dot_product_attention(q, k, v, attn_mask=key_mask)
         x = x + self.out(read.transpose(1, 2).flatten(2))
         return x + self.down(functional.gelu(self.up(self.mlp_norm(x))))
 

@@ -1,5 +1,6 @@
 """MemoryVLA's action head: a diffusion transformer over a chunk, conditioned on cognition and perceptual tokens."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.config import check_positive
-from mme_vla.errors import check_choice, check_multiple
+from mme_vla.errors import check_choice, check_multiple, require
 
 STEPS = 100
 LARGEST_BETA = 0.999
@@ -42,13 +43,15 @@ class Schedule:
         """The steps that DDIM visits, ascending: every k-th from 0, with the smallest k that gives exactly `count`.
 
         Raises:
-            ValueError: no k does.
+            UserError: no k does.
         """
-        for stride in range(1, len(self) + 1):
-            visited = np.arange(0, len(self), stride)
-            if len(visited) == count:
-                return visited
-        raise ValueError(f"No whole stride visits {count} of {len(self)} diffusion steps; choose another number.")
+        strides = {math.ceil(len(self) / stride): stride for stride in range(len(self), 0, -1)}
+        require(
+            count in strides,
+            f"flow_steps={count}: MemoryVLA visits every k-th of {len(self)} diffusion steps, so it samples in "
+            f"{', '.join(map(str, sorted(strides)))}.",
+        )
+        return np.arange(0, len(self), strides[count])
 
     def ddim(self, noise: Tensor, count: int, predict: Callable[[Tensor, int], Tensor]) -> list[Tensor]:
         """Go back from noise [b, h, a] in `count` steps without new noise (η = 0).

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.backbone.flow import interpolate
+from mme_vla.config.devices import fused_kernels
 from mme_vla.methods.simplememvla.config import HeadSizes
 from mme_vla.types import TensorStruct
 
@@ -88,7 +89,8 @@ class Attention(nn.Module):
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         q, k = rotate(q, *rope), rotate(k, *rope)
         dropout = self.dropout if self.training else 0.0
-        read = functional.scaled_dot_product_attention(q, k, v.to(q), mask[:, None, None], dropout)
+        with fused_kernels(q):
+            read = functional.scaled_dot_product_attention(q, k, v.to(q), mask[:, None, None], dropout)
         return self.out_proj(read.transpose(1, 2).flatten(2))
 
 
