@@ -73,7 +73,8 @@ class Registry[T]:
             raise UserError(f"The section of the {self.kind} needs a name. {did_you_mean('', self)}")
         entry: Any = self[section["name"]]
         if twice := sorted(set(options) & set(fixed)):
-            raise UserError(f"{self.kind} {section['name']!r}: {twice[0]} is not an option; it follows from the other parts.")
+            name = f"{self.kind} {section['name']!r}"
+            raise UserError(f"{name}: {twice[0]} is not an option; it follows from the other parts.")
         signature = inspect.signature(entry)
         try:
             signature.bind(*args, **fixed, **options)
@@ -88,7 +89,7 @@ class Registry[T]:
             raise self._refused(section, fixed, len(args), str(error)) from error
 
     def _refused(self, section: Mapping[str, Any], fixed: Mapping[str, Any], given: int, why: str) -> UserError:
-        """The error about a section's options, with those that its constructor and the ones it passes them on to take."""
+        """The error about a section's options, with those that its constructor and its base classes' take."""
         options = {key: value for key, value in section.items() if key != "name"}
         entry: Any = self[section["name"]]
         makers = [c.__init__ for c in inspect.getmro(entry)] if isinstance(entry, type) else [entry]

@@ -298,7 +298,12 @@ class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recom
 
     def embed(self, batch: Batch) -> list[Block]:
         """Blocks `images`, of all views (`batch.view_tokens` where they were encoded before), and `prompt`."""
-        views = batch.images.shape[1]
+        views, words = batch.images.shape[1], batch.prompt.shape[1]
+        require(views <= MAX_VIEWS, f"backbone=nano takes {MAX_VIEWS} cameras; embodiment.cameras names {views}.")
+        require(
+            words <= MAX_WORDS,
+            f"backbone=nano reads {MAX_WORDS} tokens of a prompt, and this one has {words}: shorten the prompt format.",
+        )
         tokens = self.condition_on_prompt(self._view_tokens(batch, views), batch.prompt, batch.prompt_mask)
         located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
         encoded = located + self.see(located)

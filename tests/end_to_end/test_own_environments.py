@@ -106,7 +106,7 @@ def test_maniskills_pick_cube_is_recorded_trained_and_evaluated(tmp_path: Path) 
     out = run(tmp_path, "pick_cube", "record", *words, "tasks=all", "episodes=2", "output=data")
     assert "2 episodes" in out and "0 did not succeed" in out
     run(tmp_path, "pick_cube", "train", *words, "data.sources=[data]", "model=pi05", "backbone=nano",
-        "backbone.state_dim=7", "train=nano", "train.steps=2", "train.save_every=2", "train.val_samples=0",
+        "train=nano", "train.steps=2", "train.save_every=2", "train.val_samples=0",
         "train.batch_size=4", "logger=none", "output=run")  # fmt: skip
     run(tmp_path, "pick_cube", "evaluate", *words, "checkpoint=run/checkpoints/step_000002", "--trust-plugins",
         "tasks=all", "episodes=1", "workers=1", "max_steps=4", "output=evaluated")  # fmt: skip

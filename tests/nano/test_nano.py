@@ -34,6 +34,16 @@ def test_it_keeps_a_backbones_contract() -> None:
     check_backbone("nano", **SMALL)
 
 
+def test_more_cameras_or_words_than_it_has_places_for_are_refused() -> None:
+    policy = build_policy("pi05", backbone="nano")
+    batch = policy.full_batch()
+    views = batch.images[:, :1].expand(-1, 5, -1, -1, -1)
+    with pytest.raises(UserError, match=r"takes 4 cameras; embodiment\.cameras names 5"):
+        policy.backbone.embed(replace(batch, images=views, image_mask=batch.image_mask[:, :1].expand(-1, 5)))
+    with pytest.raises(UserError, match="reads 256 tokens of a prompt, and this one has 300"):
+        policy.backbone.embed(replace(batch, prompt=torch.ones(1, 300, dtype=torch.int64)))
+
+
 def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
     made = replace(demonstration(), boundaries=np.array([0, 66]))
     made.save(tmp_path / "a.npz")

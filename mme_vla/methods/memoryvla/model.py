@@ -216,18 +216,6 @@ class MemoryVlaCore(Core):
     def init_state(self) -> BankStates:
         return BankStates(self.cognition_bank.init_state(1), self.perceptual_bank.init_state(self.patches))
 
-    def loss(
-        self,
-        cognition: Tensor,
-        features: Tensor,
-        actions: Tensor,
-        times: Tensor,
-        sequences: Sequence[Tensor],
-        draws: Mapping[str, Tensor],
-    ) -> Tensor:
-        """As `noise_error`, of m moments as `through` takes them."""
-        return self.noise_error(actions, *self.through(cognition, features, times, sequences), draws)
-
     def through(
         self,
         cognition: Tensor,

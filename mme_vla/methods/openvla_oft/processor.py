@@ -55,11 +55,6 @@ class ClippedQuantiles:
         low, span, scaled, _ = self._on(y)
         return torch.where(scaled, (y + 1) / 2 * span + low, y)
 
-    def zero(self) -> np.ndarray:
-        """What 0 becomes [d], not clipped: the padding of actions that are differences."""
-        y = 2 * (0 - self.low) / (self.high - self.low + EPSILON) - 1
-        return np.where(self.scaled, np.where(self.still, 0.0, y), 0.0)
-
     def _on(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         require(
             x.is_floating_point() and x.shape[-1] == len(self.low),

@@ -54,7 +54,7 @@ def test_a_bank_that_cannot_be_is_refused(options: dict[str, object]) -> None:
 
 
 def test_a_number_of_ddim_steps_that_no_stride_gives_is_refused() -> None:
-    with pytest.raises(UserError, match="flow_steps=51: .* of 100 diffusion steps, so it samples in 1, 2, 3"):
+    with pytest.raises(UserError, match=r"flow_steps=51: .* of 100 diffusion steps, so it samples in 1, 2, 3"):
         Schedule.cosine(100).ddim_steps(51)
 
 

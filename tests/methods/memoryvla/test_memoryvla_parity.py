@@ -237,7 +237,8 @@ def test_memoryvla_training_loss_over_two_groups(folder: Path, meta: dict[str, A
     cognition = cognition_token(hidden, meta["sizes"]["patches"], golden["attention_mask"].sum(1))
     draws = {"noise": golden["noise"], "steps": golden["steps"], "drop": golden["drop_draw"]}
     groups = torch.arange(len(hidden)).split(meta["sizes"]["group_size"])
-    loss = network.loss(cognition, vision, golden["actions"], golden["times"], groups, draws).mean()
+    read = network.through(cognition, vision, golden["times"], groups)
+    loss = network.noise_error(golden["actions"], *read, draws).mean()
     near(loss, golden["loss"])
     loss.backward()
     near(hidden.grad, golden["grad_hidden"], LONG)  # type: ignore[arg-type]
