@@ -49,9 +49,9 @@ def label_column(source: EpisodeSource, name: str, key: str) -> np.ndarray:
         UserError: no such column, or a value that is missing, not finite or of another size; it names the episode.
     """
     if name == BOUNDARY:
-        return _boundaries(source)
+        return _boundaries(source, name)
     if name == SUBTASK:
-        begun, first = np.cumsum(_boundaries(source)), np.cumsum(source.lengths) - source.lengths
+        begun, first = np.cumsum(_boundaries(source, name)), np.cumsum(source.lengths) - source.lengths
         return (begun - np.repeat(begun[first] - 1, source.lengths)).astype(np.float32)
     column = _read(source, name, key)
     values = column.combine_chunks()
@@ -85,14 +85,14 @@ def weight_column(source: EpisodeSource, name: str) -> np.ndarray:
     return weights
 
 
-def text_column(source: EpisodeSource, name: str) -> pa.ChunkedArray:
-    """The text of every frame of a dataset (`data.texts`)."""
-    column = _read(source, name, "data.texts")
+def text_column(source: EpisodeSource, name: str, key: str = "data.texts") -> pa.ChunkedArray:
+    """The text of every frame of a dataset; `key` names the column in messages."""
+    column = _read(source, name, key)
     require(
         pa.types.is_string(column.type) or pa.types.is_large_string(column.type),
-        f"data.texts: the column {name!r} of {source.name} holds {column.type}, no texts.",
+        f"{key}: the column {name!r} of {source.name} holds {column.type}, no texts.",
     )
-    _check(source, name, "data.texts", column.is_null().to_numpy(zero_copy_only=False), "has no value")
+    _check(source, name, key, column.is_null().to_numpy(zero_copy_only=False), "has no value")
     return column
 
 
@@ -103,8 +103,9 @@ def _read(source: EpisodeSource, name: str, key: str) -> Any:
     return pa.concat_tables([pq.read_table(file, columns=[name]) for file in files])[name]
 
 
-def _boundaries(source: EpisodeSource) -> np.ndarray:
-    codes = text_column(source, "simple_subgoal").combine_chunks().dictionary_encode().indices.to_numpy()
+def _boundaries(source: EpisodeSource, label: str) -> np.ndarray:
+    subgoals = text_column(source, "simple_subgoal", f"the label {label}")
+    codes = subgoals.combine_chunks().dictionary_encode().indices.to_numpy()
     begins = np.concatenate([[True], np.diff(codes) != 0])
     begins[np.cumsum(source.lengths) - source.lengths] = True
     return begins.astype(np.float32)

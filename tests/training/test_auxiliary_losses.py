@@ -1,5 +1,6 @@
 """Auxiliary losses, their labels from dataset columns, and sample weights."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -177,3 +178,15 @@ def test_an_absent_column_is_reported() -> None:
         UserError, match=r"Unknown column of sample \(data.weights\) 'step_id'. Did you mean 'step_idx'"
     ):
         label_column(EpisodeSource("sample"), "step_id", "data.weights")
+
+
+def test_the_start_of_a_sub_task_names_the_column_that_it_needs(tmp_path: Path) -> None:
+    root = tmp_path / "sample"
+    shutil.copytree(SAMPLE, root)
+    (root / "SHA256SUMS").unlink(missing_ok=True)
+    pq.write_table(pq.read_table(root / TABLE).drop_columns(["simple_subgoal"]), root / TABLE)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    del info["features"]["simple_subgoal"]
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(UserError, match=rf"\(the label {BOUNDARY}\) 'simple_subgoal'"):
+        label_column(EpisodeSource(root), BOUNDARY, "The policy's labels")
