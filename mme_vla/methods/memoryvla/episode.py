@@ -26,6 +26,8 @@ class Writer(Host, Protocol):
 
     def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates: ...
 
+    def store(self, banks: BankStates, cognition: Tensor, features: Tensor) -> BankStates: ...
+
 
 class MemoryVlaEpisode(Episode):
     """Banks beside the current view.
@@ -37,16 +39,29 @@ class MemoryVlaEpisode(Episode):
     def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self._writer = policy
-        self.banks: BankStates = policy.banked.init_state()
+        self._banks = policy.banked.init_state()
+        self._moments: list[np.ndarray] = []
         self.pending: tuple[Tensor, Tensor] | None = None
         """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
         self._due: np.ndarray | None = None
+
+    @property
+    def banks(self) -> BankStates:
+        """What the banks hold. Moments of the video are read with the goal, so they are written once it is needed."""
+        if self._moments:
+            self._banks = self._writer.write(self._banks, np.stack(self._moments), self.prompt)
+            self._moments = []
+        return self._banks
+
+    @banks.setter
+    def banks(self, banks: BankStates) -> None:
+        self._banks, self._moments = banks, []
 
     def _take(
         self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None
     ) -> None:
         if self.pending is not None:
-            self.banks = self._writer.banked.store(self.banks, *self.pending)
+            self.banks = self._writer.store(self.banks, *self.pending)
             self.pending = None
         moments = []
         for i in range(len(demo)):
@@ -59,8 +74,7 @@ class MemoryVlaEpisode(Episode):
                 assert image is not None, "all frames are rendered for banks"
                 self._due = image.copy()
         super()._take(frames, demo, executed, states)
-        if moments:
-            self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
+        self._moments = [*self._moments, *moments]  # a twin of this episode has its own list
 
     # Writable memory (`policy/capabilities.py`)
 

@@ -276,6 +276,12 @@ class MemoryVlaPolicy(NetworkPolicy):
                 banks = self.banked.store(banks, cognition[i], features[i])
         return banks
 
+    @torch.no_grad()
+    def store(self, banks: BankStates, cognition: Tensor, features: Tensor) -> BankStates:
+        """Banks after the moment at which a chunk was chosen, [1, d] and [p, c]."""
+        with self.autocast():
+            return self.banked.store(banks, cognition, features)
+
     def require_processor(self) -> MemoryVlaProcessor:
         processor = super().require_processor()
         assert isinstance(processor, MemoryVlaProcessor)

@@ -138,6 +138,21 @@ def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, 
     np.testing.assert_allclose(policy.act(straight), policy.act(parts), atol=1e-4)
 
 
+def test_a_video_that_comes_before_its_goal_is_read_with_the_goal() -> None:
+    """As over the MME-VLA protocol, where past frames come before the first prompt."""
+    policy = tiny()
+    apart, together = policy.start_episode(""), policy.start_episode("press the button")
+    video = frames(17)
+    for episode in (apart, together):
+        episode.add_frames(video[policy.embodiment.memory_camera], is_demo=True)
+    apart.goal = "press the button"
+    assert apart.banks.count == 2
+    torch.testing.assert_close(apart.banks.cognition.entries, together.banks.cognition.entries)
+    other = policy.start_episode("")
+    other.add_frames(video[policy.embodiment.memory_camera], is_demo=True)
+    assert not torch.equal(other.banks.cognition.entries, apart.banks.cognition.entries)
+
+
 def test_episodes_in_one_batch_act_as_alone_and_their_past_matters() -> None:
     policy = tiny()
     chunks = {}
