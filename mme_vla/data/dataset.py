@@ -90,9 +90,8 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
     Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside
-    them. They depend on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data:
-    tables and token caches are memory-mapped, and an item decodes only the images of its window, most often the
-    current ones.
+    them. They depend on (seed, epoch, index) alone, whatever worker makes them. Tables and token caches are
+    memory-mapped, and an item decodes only the images of its window, most often the current ones.
     """
 
     def __init__(

@@ -150,7 +150,7 @@ class Episode:
     ) -> None:
         """Add frames to memory alone, for a client that sends past frames and the current view apart.
 
-        `add_frames`, then `set_view` at the last of them, is what `observe` does.
+        `add_frames`, then `set_view` at the last of them, is what `observe` does for a policy that reads one view.
 
         Args:
             frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
@@ -398,7 +398,7 @@ class Episode:
         require(self._recent, "No frame was observed yet: call observe() with the current frame before act().")
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
-        require(view in frames, f"observe() needs the camera {view!r}; got {sorted(frames)}.")
+        require(view in frames, f"This policy needs images of the camera {view!r}; got {sorted(frames)}.")
         array = np.asarray(frames[view])
         require(
             array.ndim == 4 and array.shape[-1] == 3 and array.dtype == np.uint8,

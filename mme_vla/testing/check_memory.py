@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import mme_vla.memory  # noqa: F401  (registers what ships)
 from mme_vla.memory.base import Memory, encode_histories, make_scorer, stack_history, start_stream, uses_proprio
 from mme_vla.memory.history import CachedHistory, FrameScores, History, OnlineHistory
 from mme_vla.registry import MEMORIES

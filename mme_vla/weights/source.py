@@ -208,7 +208,7 @@ def _variants_with(leaves: Collection[str], word: str) -> list[str]:
 
 
 def detect_format(source: str | Path) -> str:
-    """Say what `source` is: `ours`, `lerobot`, `openpi` or `released`."""
+    """The key of `FORMATS` that `source` has."""
     return open_source(source).format
 
 
