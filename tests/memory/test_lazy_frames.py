@@ -43,10 +43,10 @@ def test_a_lazy_history_holds_what_an_eager_one_does(rendered: np.ndarray | None
         lazy.gather(np.array([[4, 0]]))
 
 
-@pytest.mark.parametrize("model", ["ttt_expert", "rmt_context"])
-def test_a_recurrent_policy_encodes_the_frames_it_reads_and_acts_as_ever(
-    model: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(
+    "model", ["ttt_expert", "rmt_context", "bank_modul", "anchors_modul", "moment_modul", "gist_modul"]
+)
+def test_a_policy_encodes_the_frames_it_reads_and_acts_as_ever(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, frames = small_policy(model), moving_frames(40)
 
     def actions(policy: MMEPolicy) -> tuple[list[np.ndarray], int]:
