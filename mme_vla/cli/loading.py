@@ -81,7 +81,7 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
     compiles = isinstance(policy, CompilesSampling)
     if sampling == "eager" or (sampling == "auto" and not (on_gpu and compiles and policy.compiles_sampling)):
         return
-    if not isinstance(policy, CompilesSampling):
+    if not isinstance(policy, CompilesSampling) or (sampling == "graph" and not policy.compiles_sampling):
         raise UserError(
             f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set sampling=eager."
         )

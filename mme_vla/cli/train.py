@@ -1,7 +1,6 @@
 """`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
 
 import shlex
-import sys
 import time
 from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
@@ -215,8 +214,10 @@ def cache_command() -> str:
     """The command that builds the vision cache of this run: the same words, but for those on resuming and output."""
     from hydra.core.hydra_config import HydraConfig
 
-    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
+    from mme_vla.config.composition import command_trees
+
+    running = HydraConfig.initialized()
+    overrides = HydraConfig.get().overrides.task if running else ["model=<model>", "data=<data>"]
     words = [word for word in overrides if not word.startswith(("resume=", "output=", "trainings="))]
-    if "--config-dir" in sys.argv[:-1]:
-        words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
-    return shlex.join(["mme-vla", "cache", *words])
+    trees = [part for tree in command_trees()[1:] for part in ("--config-dir", str(tree))] if running else []
+    return shlex.join(["mme-vla", "cache", *trees, *words])

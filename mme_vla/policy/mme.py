@@ -264,7 +264,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         self.backbone.compile_sampling()
         if layers:
             self.backbone.compile(dynamic=False)
-        if self.device.type != "cuda":
+        if self.device.type != "cuda" or not self.compiles_sampling:
             return
         self._sampler = CapturedSampling(self._sample, self.backbone.sampling_stamp)
         if self.processor is None:
