@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
@@ -259,11 +259,8 @@ class SAM2ActPolicy(NetworkPolicy):
     def _decide(self, scene: SceneInputs, remembered: BankState) -> tuple[Tensor, BankState]:
         cube = self.cube
         with self.autocast():
-            return decide(self.backbone, scene.to(self.device), remembered, cube, self._finder)
-
-    @cached_property
-    def _finder(self) -> PointFinder:
-        return PointFinder(self.backbone.sizes.side, self.device)
+            finder = _point_finder(self.backbone.sizes.side, self.device)
+            return decide(self.backbone, scene.to(self.device), remembered, cube, finder)
 
     # Episodes
 
@@ -334,3 +331,8 @@ class SAM2ActPolicy(NetworkPolicy):
     def warm_up_vision(self) -> None:
         side = self.backbone.encoder.side
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))
+
+
+@lru_cache(maxsize=2)
+def _point_finder(side: int, device: torch.device) -> PointFinder:
+    return PointFinder(side, device)
