@@ -42,6 +42,7 @@ NOT_RUN = {
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme_vla\.train ": "trains for minutes or hours",
     r"mme(_vla\.|-vla )nano( |$)": "trains for minutes or hours",
+    r"mme-vla vision-pretrain ": "trains for minutes; tests/nano/test_vision_pretrain.py runs it on few scenes",
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
     r"--checkpoint outputs/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
