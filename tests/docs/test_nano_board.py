@@ -24,6 +24,7 @@ def test_committed_rows_are_compressed_and_small() -> None:
     assert sum(path.stat().st_size for path in files) <= 5e6
 
 
+@pytest.mark.slow
 def test_receipts_of_committed_rows_fit_their_records() -> None:
     paths = [*nano_board.ROWS.rglob("receipt.json"), *nano_board.ROWS.parent.glob("reserved/*/receipt.json")]
     assert paths

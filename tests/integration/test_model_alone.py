@@ -49,6 +49,7 @@ def third_party(module: str) -> set[str]:
     return roots - set(sys.stdlib_module_names) - {"mme_vla"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "before"), [("README.md", BATCHES), ("docs/start/python.md", "")])
 def test_example_trains_and_imports_little(page: str, before: str) -> None:
     code = before + example(page) + REPORT

@@ -88,10 +88,11 @@ def test_backbone_and_embodiment_are_chosen_on_the_command_line() -> None:
 
 
 def test_mirrored_places_of_motions_are_refused_before_anything_is_recorded() -> None:
+    one = ["with_memory=framesamp_modul", "beside=[]", "also=[]", "drawn_for=[]"]
     with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
-        compose_rows(resolved(compose("nano", ["nano=motions", "learning.reflect=0.5"])))
+        compose_rows(resolved(compose("nano", ["nano=motions", "learning.reflect=0.5", *one])))
     with pytest.raises(UserError, match=r"backbone=nano_choice"):
-        compose_rows(resolved(compose("nano", ["nano=nano16", "with_backbone=tiny", "overrides=[]"])))
+        compose_rows(resolved(compose("nano", ["nano=nano16", "with_backbone=tiny", "overrides=[]", *one])))
 
 
 def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
