@@ -92,10 +92,10 @@ class Registry[T]:
         """The error about a section's options, with those that its constructor and its base classes' take."""
         options = {key: value for key, value in section.items() if key != "name"}
         entry: Any = self[section["name"]]
-        makers = [c.__init__ for c in inspect.getmro(entry)] if isinstance(entry, type) else [entry]
+        makers = entry.__mro__ if isinstance(entry, type) else (entry,)
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         parameters = [p for maker in makers for p in inspect.signature(maker).parameters.values() if p.kind in kinds]
-        takes = [name for name in dict.fromkeys(p.name for p in parameters) if name not in (*fixed, "self")][given:]
+        takes = [name for name in dict.fromkeys(p.name for p in parameters) if name not in fixed][given:]
         unknown = [name for name in options if name not in takes]
         hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
         text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
