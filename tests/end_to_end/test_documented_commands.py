@@ -48,7 +48,7 @@ NOT_RUN = {
     r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
     r"mme-vla probe card": "needs recorded episodes",
     r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a driver that stands in for one",
-    r"python (dagger|grpo)\.py": "tests/evaluation/test_rollouts.py and test_dagger_example.py run it",
+    r"python (dagger|grpo|reward_weighted)\.py": "tests/evaluation/test_rollouts.py or test_dagger_example.py runs it",
     r"mme_vla\.serve ": "serves until it is stopped",
     r"mme-vla harness ": "serves until it is stopped",
     r"mme-vla docs$": "opens a browser; tests/docs builds the site",
@@ -59,7 +59,7 @@ NOT_RUN = {
     r"mme-vla (convert|cache) |subgoal-build input=(path|datasets)": "needs a full dataset",
     r"--config-dir configs embodiment=two_arms": "needs a robot's dataset",
     r"mme-vla weights ": "needs released weights",
-    r"benchmarks/(gpu|episode_seeds|nano_simplememvla)\.py": "measures for minutes",
+    r"benchmarks/(gpu|episode_seeds|nano_simplememvla)\.py|benchmarks/simplememvla\.py count": "measures for minutes",
 }
 """Pattern → why the commands that it matches are not run here."""
 
