@@ -88,18 +88,18 @@ class Registry[T]:
                 raise
             raise self._refused(section, fixed, len(args), str(error)) from error
 
-    def _refused(self, section: Mapping[str, Any], fixed: Mapping[str, Any], given: int, why: str) -> UserError:
+    def _refused(self, section: Mapping[str, Any], fixed: Mapping[str, Any], n_args: int, reason: str) -> UserError:
         """The error about a section's options, with those that its constructor and its base classes' take."""
         options = {key: value for key, value in section.items() if key != "name"}
         entry: Any = self[section["name"]]
         makers = entry.__mro__ if isinstance(entry, type) else (entry,)
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         parameters = [p for maker in makers for p in inspect.signature(maker).parameters.values() if p.kind in kinds]
-        takes = [name for name in dict.fromkeys(p.name for p in parameters) if name not in fixed][given:]
+        takes = [name for name in dict.fromkeys(p.name for p in parameters) if name not in fixed][n_args:]
         unknown = [name for name in options if name not in takes]
         hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
         text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
-        return UserError(f"{self.kind} {section['name']!r} does not take these options: {text} ({why}). {hint}")
+        return UserError(f"{self.kind} {section['name']!r} does not take these options: {text} ({reason}). {hint}")
 
     def __contains__(self, name: object) -> bool:
         return name in self._entries or name in self._shipped
