@@ -183,7 +183,7 @@ def _train(
         data = prepare_data(policy, *of_run, encoder[0])
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
-        # A resumed command need not repeat it, and later checkpoints still name what the run began with.
+        # A resumed command may leave it out. Later checkpoints keep what the run began with.
         cfg["init_from"] = config["init_from"] = read_state(run.checkpoint)["config"].get("init_from")
     config["data"]["content"] = data.content
     policy.config[TRAINING] = identify(config, data.content)

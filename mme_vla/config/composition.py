@@ -111,7 +111,7 @@ def compose(
         require(folder.is_dir(), f"The config folder {str(folder)!r} does not exist.")
     words = several_memories(overrides)
     with local_hydra(trees[0], trees[1:]) as engine:
-        tree = ConfigTree(engine.config_loader, config_name, parse(words), trees == (config_dir().resolve(),))
+        tree = ConfigTree(engine.config_loader, config_name, parse(words))
         try:
             cfg = join_memories(hydra.compose(config_name, words))
         except COMPOSITION_ERRORS as error:

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import hydra
@@ -21,15 +21,10 @@ _BAD_KEY = re.compile(r"Could not override '(.+)'\.\n|Could not delete from conf
 
 
 class ConfigTree:
-    """The tree under the user's choices of groups, before any of their values. Needs an initialised Hydra.
+    """The tree under the user's choices of groups, before any of their values. Needs an initialised Hydra."""
 
-    shipped: whether it is the library's own alone, whose files do not change while a process runs.
-    """
-
-    def __init__(
-        self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override], shipped: bool = False
-    ) -> None:
-        self.loader, self.config_name, self.shipped = loader, config_name, shipped
+    def __init__(self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override]) -> None:
+        self.loader, self.config_name = loader, config_name
         names = [o for o in overrides if "." not in o.key_or_group]  # a key with dots is no group
         self.choices = [o for o in names if loader.get_group_options(o.key_or_group)]
         self.values = [o for o in overrides if o not in self.choices]
@@ -37,8 +32,7 @@ class ConfigTree:
     @cached_property
     def defaults(self) -> Any:
         """The composition of the group choices alone, as plain containers."""
-        compose = _composed_once if self.shipped else _composed
-        return compose(self.config_name, tuple(str(o.input_line) for o in self.choices))
+        return OmegaConf.to_container(hydra.compose(self.config_name, [str(o.input_line) for o in self.choices]))
 
     def explain(self, error: Exception) -> str:
         """Name what is misspelt, with the near names; Hydra's own message where nothing is."""
@@ -87,13 +81,6 @@ class ConfigTree:
             expected = _expected(default, value)
             if expected and not override.is_delete():
                 raise UserError(f"{override.input_line!r} does not fit: {override.key_or_group!r} is {expected}.")
-
-
-def _composed(config_name: str, words: tuple[str, ...]) -> Any:
-    return OmegaConf.to_container(hydra.compose(config_name, list(words)))
-
-
-_composed_once = cache(_composed)
 
 
 def _expected(default: Any, value: Any) -> str:

@@ -15,7 +15,6 @@ from mme_vla.serving.client import Client
 EXAMPLES = REPOSITORY / "examples" / "trajectories"
 ENVIRONMENT = {"PYTHONPATH": f"{REPOSITORY}:{EXAMPLES}", "OMP_NUM_THREADS": "1"}
 OPTIONS = [{"label": label, "action": f"press button {label}", "need_parameter": label == "a"} for label in "ab"]
-
 FEW = "import dagger\n\nif __name__ == '__main__':\n    dagger.main(scenes=(8, 2, 2), updates=100)\n"
 
 

@@ -65,7 +65,7 @@ def rows_at(x: Tensor, at: Tensor) -> Tensor:
 class FrameMemory(MemoryModule):
     """A subclass says which frames; all tokens of these are selected, and as many as there are."""
 
-    lazy = True  # between the frames that are selected lie many that never are
+    lazy = True  # most frames are never selected
 
     def selected_frames(self, step: int, exec_start: int) -> np.ndarray:
         """The frames that are read at `step` of an episode whose execution begins at `exec_start`; int64, ascending."""
