@@ -30,12 +30,17 @@ FLOORS = ("pi05", MATCHED)
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A row of the board. facts: of its first training. is_own: whether it is the user's."""
+    """A row of the board.
+
+    facts: of its first training. is_local: whether it is the user's. recordings: digests of the data that its trainings
+    learned from.
+    """
 
     name: str
     facts: Trained
     method: Method
     is_local: bool = False
+    recordings: frozenset[str] = frozenset()
 
     @property
     def kind(self) -> str:
@@ -267,10 +272,17 @@ class Board:
 
 
 def _row(name: str, trainings: Sequence[Training], protocol: Protocol) -> Row:
-    methods = aggregate([record for training in trainings for record in training.records], protocol).methods
+    data = trainings[0].facts.data  # of all: in a row other data are another recording, not another method
+    records = [
+        replace(record, training=record.training and replace(record.training, data=data))
+        for training in trainings
+        for record in training.records
+    ]
+    methods = aggregate(records, protocol).methods
     require(len(methods) == 1, f"The row {name} holds {len(methods)} methods: {', '.join(m.label for m in methods)}.")
     methods[0].label = name
-    return Row(name, trainings[0].facts, methods[0], trainings[0].is_local)
+    recordings = frozenset(training.facts.data for training in trainings if training.facts.data)
+    return Row(name, trainings[0].facts, methods[0], trainings[0].is_local, recordings)
 
 
 def published_success(method: PaperMethod, tasks: Sequence[str]) -> float:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from mme_vla.errors import listed
 from mme_vla.evaluation.results.compare import show_p
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import Section, html_page
@@ -123,9 +124,13 @@ def notes(board: Board) -> list[str]:
                 f"Rows of one training ({len(single)}): the interval of success is over scenes alone; that of the "
                 "place has the noise of the other rows' trainings."
             )
-    data = {row.facts.data for row in board.rows if row.facts.data}
-    if len(data) > 1:
-        lines.append(f"Rows learned from {len(data)} different sets of demonstrations.")
+    recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
+    if len(recordings) > 1:
+        several = [row.name for row in board.rows if len(row.recordings) > 1]
+        lines.append(
+            f"Rows learned from {len(recordings)} recordings of the demonstrations (digests "
+            f"{listed(sorted(recordings))}). Rows with trainings on more than one: {listed(several, 40) or 'none'}."
+        )
     return lines
 
 

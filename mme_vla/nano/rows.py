@@ -3,7 +3,6 @@
 A folder holds `config.yaml`, `run.json`, `trained.json` and `episodes.jsonl` (or `episodes.jsonl.xz`). Each file names
 what it is of. Files of different trainings, scenes or settings are one error. `scenes.json` beside the rows says which
 scenes of the split can be built: a row has the first so many of these of each task, by default of all.
-`same_data.json` there gives digests of demonstrations that are the same: an earlier digest → the present one.
 """
 
 from collections import Counter
@@ -25,7 +24,7 @@ from mme_vla.utils import read_json, read_text
 
 CONFIG, TRAINED = "config.yaml", "trained.json"
 FILES = (CONFIG, RUN_FILE, TRAINED)
-SCENES, SAME_DATA = "scenes.json", "same_data.json"
+SCENES = "scenes.json"
 CHOICES = "multi_choice"
 """The action space of the benchmark's own table; rows of another one have a table of their own."""
 _SETTINGS = {"model": "model", "split": "split", "checkpoint": "checkpoint", "seed": "model_seed"}
@@ -37,8 +36,8 @@ class Trained:
     """What `trained.json` holds; a row without a training, as of random choices, has no numbers.
 
     row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was a training. seed,
-    recipe, data, weights: its `TrainingIdentity`. budget: memory tokens. parameters: learned ones. update_s,
-    update_flops: of one update. cpu_minutes: of the training.
+    recipe, data, weights: its `TrainingIdentity`. demonstrations: their number for each task. budget: memory tokens.
+    parameters: learned ones. update_s, update_flops: of one update. cpu_minutes: of the training.
     """
 
     row: str
@@ -48,6 +47,7 @@ class Trained:
     recipe: str | None = None
     data: str | None = None
     weights: str | None = None
+    demonstrations: Mapping[str, int] | None = None
     budget: int | None = None
     parameters: int | None = None
     update_s: float | None = None
@@ -161,10 +161,6 @@ def read_training(folder: Path) -> Training:
     settings = run["settings"]
     n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
     rules = f"action_space={records[0].action_space}, max_choices={n_choices}, only_possible={possible}"
-    digests = folder.parent.parent / SAME_DATA
-    if digests.is_file() and facts.data in (same := read_json(digests, "digests of the same demonstrations")):
-        facts = replace(facts, data=same[facts.data])
-        records = [replace(record, training=facts.identity) for record in records]
     return Training(folder, facts, _numbered(folder, records), rules)
 
 
@@ -229,8 +225,11 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
 
 
 def _check_alike(first: Training, other: Training) -> None:
-    """Make sure that two trainings of a row are of one recipe, and not the same one."""
-    for name in ("kind", "recipe", "data", "budget"):
+    """Make sure that two trainings of a row are of one recipe, and not the same one.
+
+    Their digests of the data may differ: demonstrations recorded on another processor end otherwise here and there.
+    """
+    for name in ("kind", "recipe", "demonstrations", "budget"):
         values = [getattr(training.facts, name) for training in (first, other)]
         require(
             values[0] == values[1],

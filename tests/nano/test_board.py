@@ -325,14 +325,17 @@ def test_trainings_of_a_row_are_of_one_recipe_and_not_copies(tmp_path: Path) -> 
         read_rows([tmp_path / "b"])
 
 
-def test_demonstrations_with_two_digests_are_the_same_where_the_table_says_so(tmp_path: Path) -> None:
-    write_training(tmp_path, "a", 0, 3)
-    write_training(tmp_path, "a", 1, 1, data="earlier")
-    with pytest.raises(UserError, match="data is d and earlier"):
+def test_trainings_of_a_row_may_have_other_recordings_of_as_many_demonstrations(tmp_path: Path) -> None:
+    write_training(tmp_path, "a", 0, 3, demonstrations={"BinFill": 4})
+    write_training(tmp_path, "a", 1, 1, demonstrations={"BinFill": 4}, data="another processor")
+    board = Board(read_rows([tmp_path]), samples=20)
+    assert len(board.rows[0].method.trainings) == 2
+    assert any(
+        "(digests another processor, d)" in line and "more than one: a." in line for line in board_page.notes(board)
+    )
+    write_training(tmp_path, "a", 2, 1, demonstrations={"BinFill": 5})
+    with pytest.raises(UserError, match=r"demonstrations is {'BinFill': 4} and {'BinFill': 5}"):
         read_rows([tmp_path])
-    write_json(tmp_path / "same_data.json", {"earlier": "d"})
-    assert [training.facts.data for training in read_rows([tmp_path])["a"]] == ["d", "d"]
-    assert Board(read_rows([tmp_path]), samples=20).rows[0].average.std > 0, "they are two rows"
 
 
 def test_a_folder_without_rows_is_refused(tmp_path: Path) -> None:
