@@ -126,10 +126,10 @@ def notes(board: Board) -> list[str]:
             )
     recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
     if len(recordings) > 1:
-        several = [row.name for row in board.rows if len(row.recordings) > 1]
+        several = sum(len(row.recordings) > 1 for row in board.rows)
         lines.append(
-            f"Rows learned from {len(recordings)} recordings of the demonstrations (digests "
-            f"{listed(sorted(recordings))}). Rows with trainings on more than one: {listed(several, 40) or 'none'}."
+            f"{len(recordings)} recordings of the demonstrations (digests {listed(sorted(recordings))}). Rows with "
+            f"trainings on more than one: {several} (`data` of `trained.json`)."
         )
     return lines
 

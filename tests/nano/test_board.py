@@ -331,7 +331,7 @@ def test_trainings_of_a_row_may_have_other_recordings_of_as_many_demonstrations(
     board = Board(read_rows([tmp_path]), samples=20)
     assert len(board.rows[0].method.trainings) == 2
     assert any(
-        "(digests another processor, d)" in line and "more than one: a." in line for line in board_page.notes(board)
+        "(digests another processor, d)" in line and "more than one: 1 " in line for line in board_page.notes(board)
     )
     write_training(tmp_path, "a", 2, 1, demonstrations={"BinFill": 5})
     with pytest.raises(UserError, match=r"demonstrations is {'BinFill': 4} and {'BinFill': 5}"):
