@@ -32,8 +32,8 @@ class VisionConfig:
     num_heads: int = 16
 
     def __post_init__(self) -> None:
-        check_positive(self, "vision.")
-        check_multiple("vision.", "image_size", self.image_size, "patch_size", self.patch_size)
+        check_positive(self, "backbone.vision.")
+        check_multiple("backbone.vision.", "image_size", self.image_size, "patch_size", self.patch_size)
 
 
 @dataclass(frozen=True)

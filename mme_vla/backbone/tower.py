@@ -61,11 +61,11 @@ class TowerConfig:
     layout: str = "segments"
 
     def __post_init__(self) -> None:
-        check_positive(self, "vision.")
-        check_choice("vision.layout", self.layout, ("places", "segments"))
-        check_multiple("vision.", "image_size", self.image_size, "stride", 16)
+        check_positive(self, "backbone.vision.")
+        check_choice("backbone.vision.layout", self.layout, ("places", "segments"))
+        check_multiple("backbone.vision.", "image_size", self.image_size, "stride", 16)
         for name in ("width_32", "width_16", "width_8"):
-            check_multiple("vision.", name, getattr(self, name), "groups", 8)
+            check_multiple("backbone.vision.", name, getattr(self, name), "groups", 8)
 
     @property
     def widths(self) -> tuple[int, int, int]:

@@ -92,9 +92,9 @@ class DitConfig:
     perceptual_init: str = "zero"
 
     def __post_init__(self) -> None:
-        check_positive(self, "head.")
-        check_multiple("head.", "width", self.width, "num_heads", self.num_heads)
-        check_choice("head.perceptual_init", self.perceptual_init, INITS)
+        check_positive(self, "backbone.head.")
+        check_multiple("backbone.head.", "width", self.width, "num_heads", self.num_heads)
+        check_choice("backbone.head.perceptual_init", self.perceptual_init, INITS)
 
 
 def step_features(steps: Tensor) -> Tensor:

@@ -16,10 +16,11 @@ class TowerConfig:
     mlp_dim: int
     num_heads: int
 
-    def __post_init__(self) -> None:
-        check_positive(self, "a vision tower's ")
-        require(self.depth >= 2, f"A vision tower of depth={self.depth} has no block before its last: at least 2.")
-        check_multiple("vision.", "width", self.width, "num_heads", self.num_heads)
+    def check(self, section: str) -> None:
+        """Raise an error that names a key of its section, such as `backbone.vision.dino.`, if it has no such tower."""
+        check_positive(self, section)
+        require(self.depth >= 2, f"{section}depth={self.depth} has no block before its last: at least 2.")
+        check_multiple(section, "width", self.width, "num_heads", self.num_heads)
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,10 @@ class FusedVisionConfig:
     siglip: TowerConfig = field(default_factory=lambda: TowerConfig(1152, 27, 4304, 16))
 
     def __post_init__(self) -> None:
-        check_sizes("vision", image_size=self.image_size, patch_size=self.patch_size)
-        check_multiple("vision.", "image_size", self.image_size, "patch_size", self.patch_size)
+        check_sizes("backbone.vision", image_size=self.image_size, patch_size=self.patch_size)
+        check_multiple("backbone.vision.", "image_size", self.image_size, "patch_size", self.patch_size)
+        self.dino.check("backbone.vision.dino.")
+        self.siglip.check("backbone.vision.siglip.")
 
     @property
     def width(self) -> int:
@@ -61,8 +64,8 @@ class LlamaConfig:
     norm_eps: float = 1e-6
 
     def __post_init__(self) -> None:
-        check_positive(self, "vlm.")
-        check_multiple("vlm.", "width", self.width, "2 · num_heads", 2 * self.num_heads)
+        check_positive(self, "backbone.vlm.")
+        check_multiple("backbone.vlm.", "width", self.width, "2 · num_heads", 2 * self.num_heads)
 
 
 @dataclass(frozen=True)
