@@ -200,7 +200,8 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
 def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
     """Digests of demonstrations: of their scenes, goals, numbers of decisions and letters, and `carried_out`.
 
-    They are the same on every machine. States and poses differ in their last bits between processors.
+    States and poses are left out: they differ in their last bits between processors. A demonstration that ends
+    otherwise on another processor has another digest.
     """
     digests = []
     for file in files:
