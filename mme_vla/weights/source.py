@@ -294,7 +294,7 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
 
 
 def _of_torch_file(path: Path) -> Source:
-    names = list(read_torch_file(path))
+    names = list(read_torch_file(path, mapped=True))
     for name in NATIVE_FORMATS:
         if METHOD_FORMATS[name].function("matches")(names):
             return Source(name, path.parent, (path,))

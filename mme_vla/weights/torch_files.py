@@ -1,5 +1,6 @@
 """Checkpoints that `torch.save` wrote, read without running anything in them."""
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,20 +22,21 @@ def find_torch_files(folder: Path) -> list[Path]:
 _REMEDY = "It is damaged, or holds objects, which are code and are not run. Download or copy it again."
 
 
-def load_torch_file(path: Path, what: str) -> Any:
+def load_torch_file(path: Path, what: str, mapped: bool = False) -> Any:
     """Read a file that `torch.save` wrote, tensors on the CPU. Objects in it are code, and are not run.
 
     Args:
         what: the file is, for the message.
+        mapped: read a tensor when it is used, without a check of its bytes. Files from before torch 1.6 are read whole.
     """
     require_file(path, what)  # torch would wait for a pipe without end
     with decoding(path, what, _REMEDY):
-        return torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped and zipfile.is_zipfile(path))
 
 
-def read_torch_file(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name (of tables by part: part and name)."""
-    content = load_torch_file(path, "weights")
+def read_torch_file(path: Path, mapped: bool = False) -> dict[str, Tensor]:
+    """The tensors of a file, by name (of tables by part: part and name). mapped: as for `load_torch_file`."""
+    content = load_torch_file(path, "weights", mapped)
     for key in MODEL:
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]

@@ -38,7 +38,9 @@ def write_old(path: Path) -> bytes:
 def test_both_layouts_are_read(tmp_path: Path) -> None:
     for write in (write_zip, write_old):
         write(tmp_path / "w.pth")
-        assert set(read_torch_file(tmp_path / "w.pth")) == {"a.weight", "a.bias"}
+        for mapped in (False, True):
+            tensors = read_torch_file(tmp_path / "w.pth", mapped)
+            assert set(tensors) == {"a.weight", "a.bias"} and tensors["a.weight"].sum() == 12
 
 
 @pytest.mark.parametrize("read", [read_torch_file, open_source])
