@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -193,8 +193,13 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
     best = {"val_loss": losses[-1][0] if losses else None, "best_update": min(losses)[1] if losses else None}
     if policy.embodiment.action.choice:
         errors = choice_errors(policy, val_set)
-        return best | {"accuracy": errors.accuracy, "off_by": errors.off_by, "off_by_m": None}
-    return best | {"accuracy": None, "off_by": None, "off_by_m": position_error(policy, val_set).tolist()}
+        return best | asdict(errors) | {"off_by_m": None}
+    return best | {
+        "accuracy": None,
+        "points": None,
+        "off_by": None,
+        "off_by_m": position_error(policy, val_set).tolist(),
+    }
 
 
 def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:

@@ -292,13 +292,20 @@ def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tens
     return (predicted - recorded)[:, :2].norm(dim=1)
 
 
+NEAR = 0.05
+"""Of the image's side: a point this near lies on the object that it means."""
+
+
 @dataclass(frozen=True)
 class ChoiceErrors:
-    """Of held-out choices. accuracy: task → share of right letters. off_by: median distance of points, in shares of the
-    image's side, where a point is needed; None where none is.
+    """Of held-out choices; distances are in shares of the image's side.
+
+    accuracy: task → share of right letters. points: task → share of points within `NEAR`, of tasks that need any.
+    off_by: median distance of points; None where none is needed.
     """
 
     accuracy: dict[str, float]
+    points: dict[str, float]
     off_by: float | None
 
 
@@ -312,8 +319,12 @@ def choice_errors(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Choic
     points = recorded[:, list(space.point)]
     needed = (points - torch.tensor(MIDDLE)).abs().amax(1) > 1e-6
     off = (predicted[:, list(space.point)] - points)[needed].norm(dim=1)
-    accuracy = {task: float(right[tasks == task].mean()) for task in dict.fromkeys(val_set.tasks)}
-    return ChoiceErrors(accuracy, float(off.median()) if len(off) else None)
+    near, of_points = (off < NEAR).numpy(), tasks[needed.numpy()]
+    return ChoiceErrors(
+        {task: float(right[tasks == task].mean()) for task in dict.fromkeys(tasks.tolist())},
+        {task: float(near[of_points == task].mean()) for task in dict.fromkeys(of_points.tolist())},
+        float(off.median()) if len(off) else None,
+    )
 
 
 def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:

@@ -102,9 +102,11 @@ def test_errors_of_choices_are_counted_by_task(monkeypatch: pytest.MonkeyPatch) 
     assert decisions.batch.actions is not None
     wrong = decisions.batch.actions.clone()
     wrong[1, 0, :8] = wrong[0, 0, :8]
+    wrong[2, 0, 8:] = wrong[0, 0, 8:]  # the middle of the image
     monkeypatch.setattr(blind, "sample_actions", lambda *_: wrong)
     errors = choice_errors(blind, decisions)
     assert errors.accuracy == {"StopCube": pytest.approx(2 / 3), "BinFill": 1} and errors.off_by == pytest.approx(0)
+    assert errors.points == {"StopCube": 0.5, "BinFill": 1}
 
 
 def test_frequent_moves_are_those_of_most_demonstrations_at_each_place(tmp_path: Path) -> None:
