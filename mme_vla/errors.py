@@ -20,7 +20,8 @@ def require(holds: object, message: str, error: type[Exception] = UserError) -> 
 def check_choice(key: str, value: object, options: Iterable[str]) -> None:
     """Make sure that a value is one of the options of its key."""
     known = list(options)
-    require(isinstance(value, str) and value in known, f"{key}={brief(value)}. {did_you_mean(brief(value), known)}")
+    if not (isinstance(value, str) and value in known):
+        raise UserError(f"{key}={brief(value)}. {did_you_mean(brief(value), known)}")
 
 
 def check_sizes(section: str, **sizes: int) -> None:

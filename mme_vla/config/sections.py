@@ -79,6 +79,12 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
 _hints = cache(partial(get_type_hints, include_extras=True))
 
 
+@cache
+def _parts(kind: Any) -> tuple[Any, tuple[Any, ...]]:
+    """Origin and arguments of an annotation."""
+    return get_origin(kind), get_args(kind)
+
+
 def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
     """A mapping with no unknown key, and with a value for every required one."""
     if not isinstance(values, Mapping):
@@ -99,7 +105,7 @@ def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
 
 def _converted(value: Any, kind: Any, name: str) -> Any:
     """The value of a field: sections are read, lists become tuples."""
-    origin, inside = get_origin(kind), get_args(kind)
+    origin, inside = _parts(kind)
     if kind is Any:
         return value
     if origin in (Union, UnionType):

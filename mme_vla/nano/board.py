@@ -190,6 +190,7 @@ class Board:
         unique = {frozenset(row.name for row in pair): pair for pair in pairs}
         return compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)
 
+    @cached_property
     def separations(self) -> list[Separation]:
         """Of each budget that several memories have, and each task."""
         made = []

@@ -47,7 +47,7 @@ def tasks(board: Board) -> Table:
 def separations(board: Board) -> Table:
     """Tasks and budgets at which memories differ, the clearest first."""
     rows = []
-    for s in sorted(board.separations(), key=lambda s: (s.corrected, s.p, -s.deviation)):
+    for s in sorted(board.separations, key=lambda s: (s.corrected, s.p, -s.deviation)):
         above, below = (None if end is None else abs(s.mean - end) for end in (s.floor, s.ceiling))
         rows.append([
             s.task, s.budget or "default", str(s.memories), f"{s.lowest:.0f} … {s.mean:.0f} … {s.highest:.0f}",
@@ -60,7 +60,7 @@ def separations(board: Board) -> Table:
 
 def separating(board: Board) -> list[str]:
     """How many tasks separate memories, a sentence a budget."""
-    made = board.separations()
+    made = board.separations
     sentences = []
     for budget in dict.fromkeys(s.budget for s in made):
         here = [s for s in made if s.budget == budget]

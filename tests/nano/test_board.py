@@ -86,7 +86,7 @@ def test_policies_that_read_the_simulators_subgoals_are_ceilings(rows: Path, tmp
     write_records(folder, [replace(record, subgoal="oracle") for record in records_of(folder)])
     board = Board(read_rows([rows, tmp_path]), samples=50)
     assert row_of(board, "simplesg").kind == "ceiling" and "simplesg" not in board.places
-    assert {s.memories for s in board.separations()} == {3}
+    assert {s.memories for s in board.separations} == {3}
     assert "(framesamp_modul)" in board.targets()[0].measured
 
 
@@ -151,7 +151,7 @@ def test_the_homogeneity_test_keeps_its_level() -> None:
 
 
 def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> None:
-    made = board.separations()
+    made = board.separations
     assert [s.task for s in made] == list(board.protocol.tasks) and all(s.memories == 3 for s in made)
     first = made[0]
     assert (first.lowest, first.highest, first.ceiling) == pytest.approx((100 / 3, 500 / 6, 100))
@@ -164,7 +164,7 @@ def test_budgets_are_separate_tables(rows: Path, tmp_path: Path) -> None:
     for row in ("framesamp_modul@4", "ttt_modul@4", "framesamp_modul@16"):
         write_training(tmp_path, row, 0, 1, budget=int(row.partition("@")[2]))
     board = Board(read_rows([rows, tmp_path]), samples=50)
-    assert [(s.budget, s.memories) for s in board.separations()] == [("", 3)] * 4 + [("4", 2)] * 4
+    assert [(s.budget, s.memories) for s in board.separations] == [("", 3)] * 4 + [("4", 2)] * 4
     assert "framesamp_modul" in board_page.budget_figure(board) and all(not row.budget for row, _ in board.published)
 
 
