@@ -192,14 +192,8 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
     losses = [(line["val/loss"], line["step"]) for line in learning_curve(folder) if "val/loss" in line]
     best = {"val_loss": losses[-1][0] if losses else None, "best_update": min(losses)[1] if losses else None}
     if policy.embodiment.action.choice:
-        errors = choice_errors(policy, val_set)
-        return best | asdict(errors) | {"off_by_m": None}
-    return best | {
-        "accuracy": None,
-        "points": None,
-        "off_by": None,
-        "off_by_m": position_error(policy, val_set).tolist(),
-    }
+        return best | asdict(choice_errors(policy, val_set))
+    return best | {"off_by_m": position_error(policy, val_set).tolist()}
 
 
 def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:

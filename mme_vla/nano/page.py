@@ -108,7 +108,7 @@ def success_table(
             deviation, interval = f" ± {average.std:.0f}", Interval(*(value / 100 for value in average.interval))
         success = f"{100 * rate:.0f}{deviation} % ({cells[0]})"
         confidence = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
-        measured = [end["off_by_m"] for end in ends.get(model, ()) if end["off_by_m"] is not None]
+        measured = [end["off_by_m"] for end in ends.get(model, ()) if end.get("off_by_m") is not None]
         off = np.concatenate(measured) if measured else None
         errors = ("", "") if off is None else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
         row = (model_records[0].model, model_records[0].memory_budget or "", success, confidence, *cells[1:], *errors)
