@@ -43,8 +43,9 @@ class ExpertConfig:
     width: int
     mlp_dim: int
 
-    def __post_init__(self) -> None:
-        check_positive(self, "an expert's ")
+    def check(self, section: str) -> None:
+        """Raise an error that names a key of its section, such as `backbone.vlm.`, if no expert has such sizes."""
+        check_positive(self, section)
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,8 @@ class BackboneConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
+        self.vlm.check("backbone.vlm.")
+        self.action.check("backbone.action.")
         check_multiple("backbone.", "num_heads", self.num_heads, "num_kv_heads", self.num_kv_heads)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)  # of a rotation
         check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)  # sin and cos of the flow time

@@ -83,10 +83,11 @@ class MemoryExpert(Integration):
         The others are as `Context` has them.
         """
         super().__init__(backbone)
-        self.memory_width = width or backbone.action.width
+        self.memory_width = backbone.action.width if width is None else width
         self.memory_position = checked_position(memory_position)
         self.visibility = memory_visibility(prompt_sees_memory)
-        self._expert = ExpertConfig(self.memory_width, mlp_dim or 2 * self.memory_width)
+        self._expert = ExpertConfig(self.memory_width, 2 * self.memory_width if mlp_dim is None else mlp_dim)
+        self._expert.check("integration.")
 
     def extra_experts(self) -> dict[str, ExpertConfig]:
         return {"memory": self._expert}

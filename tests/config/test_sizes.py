@@ -9,6 +9,7 @@ from mme_vla.backbone.config import BackboneConfig
 from mme_vla.backbone.nano import NanoConfig
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
+from mme_vla.integration.context import MemoryExpert
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig
 from mme_vla.methods.openvla_oft.config import OpenVlaConfig
 
@@ -19,6 +20,8 @@ TOWER = {"width": 8, "depth": 2, "mlp_dim": 8, "num_heads": 2}
     ("config", "section", "message"),
     [
         (BackboneConfig, {"vision": {"image_size": 225}}, r"backbone\.vision\.image_size=225 must be a multiple of"),
+        (BackboneConfig, {"action": {"width": 16, "mlp_dim": -1}}, r"backbone\.action\.mlp_dim=-1 must be at least 1"),
+        (NanoConfig, {"vlm": {"width": 0, "mlp_dim": 16}}, r"backbone\.vlm\.width=0 must be at least 1"),
         (NanoConfig, {"vision": {"width_8": 9}}, r"backbone\.vision\.width_8=9 must be a multiple of"),
         (OpenVlaConfig, {"vision": {"patch_size": 0}}, r"backbone\.vision\.patch_size=0 must be at least 1"),
         (OpenVlaConfig, {"vision": {"dino": TOWER | {"depth": 1}}}, r"backbone\.vision\.dino\.depth=1 has no block"),
@@ -31,3 +34,9 @@ TOWER = {"width": 8, "depth": 2, "mlp_dim": 8, "num_heads": 2}
 def test_an_impossible_size_names_its_key(config: type, section: Mapping[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         read_section(config, section, "backbone")
+
+
+@pytest.mark.parametrize("key", ["width", "mlp_dim"])
+def test_an_impossible_size_of_the_memory_expert_names_its_key(key: str) -> None:
+    with pytest.raises(UserError, match=rf"integration\.{key}=0 must be at least 1"):
+        MemoryExpert(BackboneConfig(), **{key: 0})
