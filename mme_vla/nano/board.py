@@ -1,7 +1,7 @@
 """The board of nanoMME: rows in the order of their success, and what the differences between them are worth.
 
-Scenes are the same for all rows. Means are over tasks. Intervals come from a bootstrap that draws scenes, and trainings
-where a row has several.
+Scenes are the same for all rows. Means are over tasks. Intervals come from a bootstrap over scenes, with the noise
+between trainings that the rows show together. P values are of the trained policies, on these scenes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -156,21 +156,30 @@ class Board:
     def draws(self, rows: Sequence[Row], tasks: Sequence[str]) -> np.ndarray:
         """Bootstrap of the rows' success over tasks [rows, samples], in percent, on the same scenes for all.
 
-        A row of one training gets the noise that the trainings of other rows show.
+        The mean of n trainings has normal noise of deviation `noise`/√n: a row has too few to draw its own.
         """
-        values = {task: [row.outcomes(task) for row in rows] for task in tasks}
+        values = {task: [row.outcomes(task).mean(1, keepdims=True) for row in rows] for task in tasks}
         means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
-        noise, rng = self.noise(tasks), np.random.default_rng([self.protocol.seed, 2])
+        noise, rng = self.noise(tasks) or 0.0, np.random.default_rng([self.protocol.seed, 2])
         for row, sampled in zip(rows, means, strict=True):
-            if noise and row.facts.trained and len(row.method.trainings) == 1:
-                sampled += rng.normal(0, noise, len(sampled))
-        return means.round(9)
+            if row.facts.trained:
+                sampled += rng.normal(0, noise / len(row.method.trainings) ** 0.5, len(sampled))
+        return means.clip(0, 100).round(9)
+
+    @cached_property
+    def sampled(self) -> dict[str, np.ndarray]:
+        """`draws` over all tasks by row."""
+        return dict(zip([row.name for row in self.rows], self.draws(self.rows, self.protocol.tasks), strict=True))
+
+    def interval(self, row: Row) -> Interval:
+        """Of a row's success over all tasks, in percent."""
+        return percentiles(self.sampled[row.name])
 
     @cached_property
     def places(self) -> dict[str, tuple[int, Interval]]:
         """Place of each ranked row, equal rows sharing the better one, and an interval of it (`draws`)."""
         means = np.array([self.success(row) for row in self.ranked])
-        draws = self.draws(self.ranked, self.protocol.tasks)
+        draws = np.array([self.sampled[row.name] for row in self.ranked])
         return {
             row.name: (1 + int((means > mean).sum()), percentiles(1 + (draws > sampled).sum(0)))
             for row, mean, sampled in zip(self.ranked, means, draws, strict=True)
@@ -179,7 +188,7 @@ class Board:
     def neighbours(self) -> list[Comparison]:
         """Each row and the next; of a user's rows, with those beside them, the best and the trained floors.
 
-        P values are corrected for the number of these comparisons.
+        P values are corrected for the number of these comparisons. Intervals are of `draws`.
         """
         ranked = self.ranked
         pairs = list(pairwise(ranked))
@@ -188,7 +197,8 @@ class Board:
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
             pairs += [(other, row) for row in local for other in (ranked[0], *floors) if other is not row]
         unique = {frozenset(row.name for row in pair): pair for pair in pairs}
-        return compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)
+        made = compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)
+        return [replace(c, interval=percentiles(self.sampled[c.first] - self.sampled[c.second])) for c in made]
 
     @cached_property
     def separations(self) -> list[Separation]:
@@ -224,19 +234,24 @@ class Board:
         return sorted(known, key=lambda pair: -published_success(pair[1], PAPER_ORDER))
 
     def agreements(self) -> list[Agreement]:
-        """Rank correlations with the published success over all tasks, by suite and by task.
+        """Rank correlations with the published success over all tasks, of memories alone, by suite and by task.
 
         None below three rows, and where all are equal. Intervals are of `draws`; published figures are fixed.
         """
-        rows, methods = [row for row, _ in self.published], [method for _, method in self.published]
-        kinds, made = ("average", "suite", "task"), []
-        for scope in sorted((s for s in scopes(self.protocol) if s.kind in kinds), key=lambda s: kinds.index(s.kind)):
-            means = np.array([self.success(row, scope.tasks) for row in rows])
-            reported = np.array([published_success(method, scope.tasks) for method in methods])
+        memories = [(row, method) for row, method in self.published if row.kind == "policy"]
+        named = [(s.kind, s.name, s.tasks) for s in scopes(self.protocol) if s.kind in ("average", "suite", "task")]
+        named.sort(key=lambda scope: ("average", "suite", "task").index(scope[0]))
+        compared = [(name, tasks, self.published) for _, name, tasks in named]
+        compared.insert(1, ("average, memories alone", self.protocol.tasks, memories))
+        made = []
+        for name, tasks, pairs in compared:
+            rows = [row for row, _ in pairs]
+            means = np.array([self.success(row, tasks) for row in rows])
+            reported = np.array([published_success(method, tasks) for _, method in pairs])
             if len(rows) > 2 and np.ptp(means) and np.ptp(reported):
-                draws = self.draws(rows, scope.tasks).T
+                draws = self.draws(rows, tasks).T
                 made.append(Agreement(
-                    scope.name, len(rows), float(spearman(means, reported)), percentiles(spearman(draws, reported)),
+                    name, len(rows), float(spearman(means, reported)), percentiles(spearman(draws, reported)),
                     float(kendall(means, reported)), percentiles(kendall(draws, reported)),
                 ))  # fmt: skip
         return made
@@ -249,25 +264,26 @@ class Board:
         best, matched = next(iter(self.of_kind("policy")), None), [row for row in self.rows if row.name == MATCHED]
         if best is None:
             return [Target(name) for name in names]
-        low, high = percentiles(self.draws([best], self.protocol.tasks)[0])
-        success = self.success(best)
+        success, (low, high) = self.success(best), self.interval(best)
         first = Target(names[0], f"{success:.1f} % ({best.name})", f"[{low:.1f}, {high:.1f}]", reached=success >= 60)
         if not matched or not success:
             return [first, Target(names[1])]
-        ratios = np.divide(*self.draws([matched[0], best], self.protocol.tasks))
+        ratios = self.sampled[MATCHED] / self.sampled[best.name]
         share, (low, high) = self.success(matched[0]) / success, percentiles(ratios)
         second = Target(
             names[1], f"{100 * share:.0f} % of it", f"[{100 * low:.0f}, {100 * high:.0f}]", reached=share <= 0.5
         )
         suites = [(suite, tuple(self.protocol.choose("suite", suite))) for suite in self.protocol.suites]
         compared = [compare(best.method, matched[0].method, replace(self.protocol, tasks=tasks)) for _, tasks in suites]
+        intervals = [percentiles(np.subtract(*self.draws([best, matched[0]], tasks))) for _, tasks in suites]
         advantages = [
             Target(
-                f"significant advantage in {suite}", f"{c.difference:+.1f} points",
-                f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]", f"{c.wins} : {c.losses}, p = {p:.4f}",
-                reached=p < 0.05 and c.interval.low > 0,
+                f"significant advantage in {suite}", f"{c.difference:+.1f} points", f"[{low:+.1f}, {high:+.1f}]",
+                f"{c.wins} : {c.losses}, p = {p:.4f}", reached=p < 0.05 and low > 0,
             )
-            for (suite, _), c, p in zip(suites, compared, holm([c.p for c in compared]), strict=True)
+            for (suite, _), c, (low, high), p in zip(
+                suites, compared, intervals, holm([c.p for c in compared]), strict=True
+            )
         ]  # fmt: skip
         return [first, second, *advantages]
 

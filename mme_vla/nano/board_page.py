@@ -33,7 +33,7 @@ def ranking(board: Board, brief: bool = False) -> Table:
         numbers = [(facts.parameters, ",.0f"), (gflops, ".2f"), (facts.update_s, ".3f"), (facts.cpu_minutes, ".1f")]
         costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
         strong |= {len(rows)} if row.is_local else set()
-        rows.append([row.name, at, trainings, show(row.average), span(row.average), *cells, *costs])
+        rows.append([row.name, at, trainings, show(row.average), span(board.interval(row)), *cells, *costs])
     return Table(f"Ranking, split {board.split}", columns, rows, strong=strong)
 
 
@@ -66,10 +66,11 @@ def separating(board: Board) -> list[str]:
         here = [s for s in made if s.budget == budget]
         separated = [s.task for s in here if s.corrected < 0.05]
         tokens = f"At {budget} tokens" if budget else "At the default budgets"
+        rows = [row for row in board.of_kind("policy") if row.budget == budget]
+        compared = "memories" if min(len(row.method.trainings) for row in rows) > 1 else "trained policies"
         names = f": {', '.join(separated)}" if separated else ""
         sentences.append(
-            f"{tokens} {len(separated)} of {len(here)} tasks separate the {here[0].memories} memories "
-            f"(p < 0.05){names}."
+            f"{tokens} the {len(rows)} {compared} differ in {len(separated)} of {len(here)} tasks (p < 0.05){names}."
         )
     return sentences
 
@@ -109,7 +110,8 @@ def targets(board: Board) -> Table:
 
 def notes(board: Board) -> list[str]:
     """What a reader of the tables has to know."""
-    noise, single = board.noise(), [row for row in board.ranked if row.facts.trained and len(row.method.trainings) == 1]
+    noise = board.noise()
+    single = sum(row.facts.trained and len(row.method.trainings) == 1 for row in board.ranked)
     actions = "" if board.action_space == CHOICES else f" Actions are `{board.action_space}`, not choices."
     lines = [
         f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split `{board.split}`, the same for "
@@ -118,12 +120,10 @@ def notes(board: Board) -> list[str]:
     if noise is None:
         lines.append("No row has two trainings: the noise between trainings is unknown, and intervals are too narrow.")
     else:
-        lines.append(f"Another training of a row changes its success by {noise:.1f} points (standard deviation).")
-        if single:
-            lines.append(
-                f"Rows of one training ({len(single)}): the interval of success is over scenes alone; that of the "
-                "place has the noise of the other rows' trainings."
-            )
+        lines.append(
+            f"Another training of a row changes its success by {noise:.1f} points (standard deviation). Intervals have "
+            f"this noise. Rows of one training: {single}."
+        )
     recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
     if len(recordings) > 1:
         several = sum(len(row.recordings) > 1 for row in board.rows)
@@ -142,7 +142,8 @@ def standing(board: Board) -> list[str]:
         if row.is_local:
             lines.append(
                 f"{row.name}: place {place} of {len(board.ranked)}, between {low:.0f} and {high:.0f} with "
-                f"{100 * board.protocol.confidence:g} % confidence, with {show(row.average)} % {span(row.average)}."
+                f"{100 * board.protocol.confidence:g} % confidence, with {show(row.average)} % "
+                f"{span(board.interval(row))}."
             )
     return lines
 
@@ -152,7 +153,7 @@ def success_figure(board: Board) -> str:
     rows = board.rows[::-1]
     with figure((7.2, 0.26 * len(rows) + 1.0)) as (canvas, (axes,)):
         for at, row in enumerate(rows):
-            low, high = row.average.interval or (0, 0)
+            low, high = board.interval(row)
             mean, colour = board.success(row), LOCAL if row.is_local else PAINT[row.kind]
             axes.plot([low, high], [at, at], color=colour, lw=1.6)
             axes.plot(mean, at, "o", color=colour, ms=6)
@@ -175,8 +176,8 @@ def budget_figure(board: Board) -> str:
         return ""
     with figure((5.6, 3.6)) as (canvas, (axes,)):
         for number, (model, rows) in enumerate(several.items()):
-            points = sorted((row.facts.budget or 0, board.success(row), row.average.interval) for row in rows)
-            gaps = np.array([(mean - of.low, of.high - mean) for _, mean, of in points if of is not None]).T
+            points = sorted((row.facts.budget or 0, board.success(row), board.interval(row)) for row in rows)
+            gaps = np.array([(mean - low, high - mean) for _, mean, (low, high) in points]).T
             axes.errorbar([b for b, *_ in points], [m for _, m, _ in points], np.maximum(gaps, 0), fmt="-o", ms=5,
                           capsize=3, color=COLOURS[number % len(COLOURS)], label=model)  # fmt: skip
         axes.set_xscale("log", base=2)

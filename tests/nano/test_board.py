@@ -70,7 +70,7 @@ def test_equal_rows_share_a_place(rows: Path, tmp_path: Path) -> None:
 
 
 def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> None:
-    """The noise between trainings is pooled over rows, and widens the place of a row that has one training."""
+    """The noise between trainings is pooled over rows."""
     assert board.noise() == pytest.approx(
         pooled([np.array([100, 200 / 3]), np.array([200 / 3, 100 / 3]), np.full(2, 100 / 3)])
     )
@@ -79,6 +79,24 @@ def test_trainings_lie_between_scenes_and_rows(board: Board, tmp_path: Path) -> 
     without = Board(read_rows([write_training(tmp_path, "present_modul", 0, {"BinFill": 1}).parent]), samples=300)
     assert draws[0].std() > without.draws(without.rows, without.protocol.tasks)[0].std() + 5
     assert board.noise(["BinFill"]) == pytest.approx(board.noise())
+
+
+def test_intervals_have_the_noise_of_a_rows_number_of_trainings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    half = dict.fromkeys(TASKS[:2], 3)  # every scene of two tasks, none of the others: nothing changes with the scenes
+    for row, seed in (("one", 0), ("four", 0), ("four", 1), ("four", 2), ("four", 3)):
+        write_training(tmp_path, row, seed, half)
+    write_training(tmp_path, "random", 0, half, "floor", trained=False, parameters=None, update_s=None)
+    monkeypatch.setattr(Board, "noise", lambda *_: 4.0)
+    board = Board(read_rows([tmp_path]))
+    deviations = {name: draws.std() for name, draws in board.sampled.items()}
+    assert deviations == pytest.approx({"one": 4, "four": 2, "random": 0}, rel=0.1)
+    low, high = board.interval(row_of(board, "one"))
+    assert (low, high) == pytest.approx((50 - 1.96 * 4, 50 + 1.96 * 4), abs=1)
+    (difference,) = (c.interval for c in board.neighbours() if {c.first, c.second} == {"one", "four"})
+    assert difference.high - difference.low == pytest.approx(2 * 1.96 * 20**0.5, rel=0.1)
+    assert "trained policies differ in" in board_page.separating(board)[0]
 
 
 def test_policies_that_read_the_simulators_subgoals_are_ceilings(rows: Path, tmp_path: Path) -> None:
@@ -157,7 +175,7 @@ def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> No
     assert (first.lowest, first.highest, first.ceiling) == pytest.approx((100 / 3, 500 / 6, 100))
     assert first.floor == pytest.approx(100 / 3) and made[1].floor == 0
     assert first.noise == pytest.approx(board.noise()) and first.corrected >= first.p
-    assert board_page.separating(board)[0].startswith("At the default budgets 0 of 4 tasks separate the 3 memories")
+    assert board_page.separating(board)[0].startswith("At the default budgets the 3 memories differ in 0 of 4 tasks")
 
 
 def test_budgets_are_separate_tables(rows: Path, tmp_path: Path) -> None:
@@ -181,7 +199,7 @@ def test_rank_correlations_are_those_of_scipy() -> None:
 def test_the_published_ranking_stands_beside(board: Board) -> None:
     assert [row.name for row, _ in board.published] == ["framesamp_modul", "ttt_modul", "rmt_modul"]
     agreements = {a.scope: a for a in board.agreements()}
-    assert list(agreements) == ["average", *board.protocol.suites, *board.protocol.tasks]
+    assert list(agreements) == ["average", "average, memories alone", *board.protocol.suites, *board.protocol.tasks]
     assert agreements["average"].spearman == 1 and agreements["average"].methods == 3
     assert agreements["average"].spearman_interval.low < 1
     cells = board_page.published(board).rows[0]

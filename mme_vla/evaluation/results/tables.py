@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mme_vla.errors import printable
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Figure, Method, Results, by_training
+from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, Results, by_training
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.results.scopes import PAPER_SEEDS
 from mme_vla.utils.pages import escape_markdown
@@ -61,9 +61,9 @@ def show(figure: Figure, short: bool = False) -> str:
     return text if figure.complete == figure.runs else f"{text} ({figure.complete} of {figure.runs} runs)"
 
 
-def span(figure: Figure) -> str:
-    """A figure's confidence interval."""
-    return "" if figure.interval is None else f"[{figure.interval.low:.1f}, {figure.interval.high:.1f}]"
+def span(interval: Interval | None) -> str:
+    """A confidence interval as text."""
+    return "" if interval is None else f"[{interval.low:.1f}, {interval.high:.1f}]"
 
 
 def show_paper(figure: Figure) -> str:
@@ -86,7 +86,7 @@ def overview(results: Results) -> Table:
             f"{average.done:,}" if average.done == average.expected else f"{average.done:,} of {average.expected:,}"
         )
         cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
-        figures = [show(average, short=True), span(average), show_paper(average)]
+        figures = [show(average, short=True), span(average.interval), show_paper(average)]
         trainings = [str(len(method.trainings))] if nested else []
         rows.append([method.label, *trainings, str(average.runs), episodes, *cells, *figures])
     over = "trainings, or over the runs of one" if nested else "runs"
@@ -103,7 +103,7 @@ def detail(method: Method, results: Results) -> Table:
         gap = "" if figure.mean is None or figure.paper is None else f"{figure.mean - figure.paper.mean:+.2f}"
         if mark:
             strong.add(len(rows))
-        rows.append([name, show(figure), span(figure), show_paper(figure), gap])
+        rows.append([name, show(figure), span(figure.interval), show_paper(figure), gap])
 
     for suite in results.protocol.suites:
         for task in results.protocol.choose("suite", suite):
