@@ -17,7 +17,7 @@ from mme_vla.evaluation.store import RECORDS
 from mme_vla.nano import board_page
 from mme_vla.nano.board import MATCHED, Board
 from mme_vla.nano.rows import CHOICES, FILES, SCENES, read_rows, read_training
-from mme_vla.utils import with_checksum, write_json
+from mme_vla.utils import read_json, with_checksum, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 ROWS = ROOT / "benchmarks" / "nano16"
@@ -45,11 +45,19 @@ def add(folder: Path) -> None:
         files = sorted(place.glob("episodes*.jsonl*"))
         lines = b"".join(lzma.decompress(f.read_bytes()) if f.suffix == ".xz" else f.read_bytes() for f in files)
         (target / f"{RECORDS}.xz").write_bytes(lzma.compress(lines, preset=9))
+        (target / "receipt.json").unlink(missing_ok=True)
         if (receipt := place / "receipt.json").is_file():
             copy_receipt(receipt, target / receipt.name)
         if (scenes := place.parents[1] / SCENES).is_file():
-            shutil.copyfile(scenes, table / SCENES)
+            add_scenes(scenes, table / SCENES)
         print(f"added {target.relative_to(ROOT)}")
+
+
+def add_scenes(file: Path, target: Path) -> None:
+    """Add what a run found of the scenes that can be built to what its table knows of them."""
+    known = read_json(target, "the scenes of a split")["tried"] if target.is_file() else {}
+    found = read_json(file, "the scenes of a split")
+    write_json(target, {**found, "tried": dict(sorted((found["tried"] | known).items()))})
 
 
 def copy_receipt(receipt: Path, target: Path) -> None:

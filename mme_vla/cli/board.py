@@ -5,13 +5,15 @@ Words of `mme-vla nano` train and evaluate a row first, as far as it is not ther
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import printable
+from mme_vla.nano.runs import as_list
 
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
@@ -36,13 +38,21 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
         args = parser.parse_intermixed_args(words)
         words = [word for word in args.words if not word.startswith("rows=")]
         trees = [args.config_dir] if args.config_dir else []
-        config = compose("nano", with_settings(words), extra_dirs=trees)
-        trained = []
+        config = resolved(compose("nano", with_settings(words), extra_dirs=trees))
+        trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
             sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
             nano()
-            trained.append(Path(config.output) / config.split)
-        run(args, str(config.split), trained)
+            trained = rows_of(config)
+        run(args, config["split"], trained)
+
+
+def rows_of(config: Mapping[str, Any]) -> list[Path]:
+    """The folders of the rows that were trained: of the models that are named, at each budget."""
+    folder = Path(config["output"]) / config["split"]
+    models, budgets = as_list(config["with_memory"]), as_list(config["budget"])
+    rows = [folder / f"{model}@{budget}" for model in models for budget in budgets]
+    return [row if row.is_dir() else row.with_name(row.name.partition("@")[0]) for row in rows]
 
 
 def alone(words: Sequence[str]) -> list[str]:

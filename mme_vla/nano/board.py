@@ -13,7 +13,15 @@ import numpy as np
 
 from mme_vla.errors import require
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import Figure, Interval, Method, aggregate, percentiles, resampled_means
+from mme_vla.evaluation.results.aggregate import (
+    Figure,
+    Interval,
+    Method,
+    aggregate,
+    percentiles,
+    resampled_means,
+    wilson,
+)
 from mme_vla.evaluation.results.compare import Comparison, compare, compare_all, holm
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
@@ -24,8 +32,6 @@ SAMPLES = 2000
 PERMUTATIONS = 9999
 MATCHED = "present_modul"
 """The floor with as many parameters as policies with memory, and tokens of the current frame alone."""
-FLOORS = ("pi05", MATCHED)
-"""The rows without memory that are trained as policies are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +53,8 @@ class Row:
         """A `policy` with memory, a `floor` or a `ceiling`, as one is that reads the simulator's subgoals."""
         if self.method.subgoal == "oracle":
             return "ceiling"
-        return "floor" if self.name.partition(" ")[0] in FLOORS else self.facts.kind
+        lacks_memory = self.facts.trained and self.facts.budget is None and self.method.subgoal is None
+        return "floor" if lacks_memory or self.name.partition(" ")[0] == MATCHED else self.facts.kind
 
     @property
     def average(self) -> Figure:
@@ -80,7 +87,8 @@ class Separation:
 
     memories: how many. lowest, mean, highest: of their success. deviation: standard one between memories, less what
     trainings add. noise: between trainings of one memory, None with one training each. floor, ceiling: of the best
-    floor and of the best ceiling. p: of `homogeneity`. corrected: by Holm over the tasks of the budget.
+    floor and of the best ceiling. p: of `homogeneity`. repeated: how many memories have several trainings. p_repeated:
+    of these alone, None below two. Both are corrected by Holm over the tasks of the budget.
     """
 
     budget: str
@@ -94,7 +102,8 @@ class Separation:
     floor: float | None
     ceiling: float | None
     p: float
-    corrected: float = 1.0
+    repeated: int
+    p_repeated: float | None
 
 
 @dataclass(frozen=True)
@@ -133,7 +142,8 @@ class Board:
         require(len(counts) == 1, f"Tasks have {sorted(counts)} scenes: a board has as many of each task.")
         self.protocol = Protocol(tuple(tasks), counts.pop(), samples=samples)
         self.split, self.action_space = next(iter(scenes.values()))[0], next(iter(rows.values()))[0].action_space
-        made = [_row(name, trainings, self.protocol) for name, trainings in rows.items()]
+        self._once = replace(self.protocol, samples=1)  # where intervals are of `draws`, and no others are read
+        made = [_row(name, trainings, self._once) for name, trainings in rows.items()]
         self.rows = sorted(made, key=lambda row: -self.success(row))
 
     def of_kind(self, kind: str) -> list[Row]:
@@ -156,15 +166,27 @@ class Board:
     def draws(self, rows: Sequence[Row], tasks: Sequence[str]) -> np.ndarray:
         """Bootstrap of the rows' success over tasks [rows, samples], in percent, on the same scenes for all.
 
-        The mean of n trainings has normal noise of deviation `noise`/√n: a row has too few to draw its own.
+        The mean of n trainings has normal noise of 1/√n of the deviation between trainings, which all rows share: a row
+        has too few to draw its own. That deviation is `noise` without the luck of episodes, which the scenes bring.
         """
         values = {task: [row.outcomes(task).mean(1, keepdims=True) for row in rows] for task in tasks}
         means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
-        noise, rng = self.noise(tasks) or 0.0, np.random.default_rng([self.protocol.seed, 2])
+        noise = max(0.0, (self.noise(tasks) or 0.0) ** 2 - self._luck(tasks)) ** 0.5
+        rng = np.random.default_rng([self.protocol.seed, 2])
         for row, sampled in zip(rows, means, strict=True):
             if row.facts.trained:
                 sampled += rng.normal(0, noise / len(row.method.trainings) ** 0.5, len(sampled))
         return means.clip(0, 100).round(9)
+
+    def _luck(self, tasks: Sequence[str]) -> float:
+        """Variance of a training's success over tasks, in percent², by episodes that end otherwise on their own."""
+        repeated = [row for row in self.rows if len(row.method.trainings) > 1]
+        degrees = [len(row.method.trainings) - 1 for row in repeated]
+        if not repeated:
+            return 0.0
+        spread = [[row.outcomes(task).var(1, ddof=1).sum() for task in tasks] for row in repeated]
+        of_rows = np.sum(spread, 1) * (100 / len(tasks) / self.protocol.episodes) ** 2
+        return float(np.average(of_rows, weights=degrees))
 
     @cached_property
     def sampled(self) -> dict[str, np.ndarray]:
@@ -172,8 +194,12 @@ class Board:
         return dict(zip([row.name for row in self.rows], self.draws(self.rows, self.protocol.tasks), strict=True))
 
     def interval(self, row: Row) -> Interval:
-        """Of a row's success over all tasks, in percent."""
-        return percentiles(self.sampled[row.name])
+        """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
+        drawn = percentiles(self.sampled[row.name])
+        if drawn.low < drawn.high:
+            return drawn
+        scenes = len(self.protocol.tasks) * self.protocol.episodes
+        return Interval(*(100 * end for end in wilson(self.success(row) / 100, scenes)))
 
     @cached_property
     def places(self) -> dict[str, tuple[int, Interval]]:
@@ -197,7 +223,7 @@ class Board:
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
             pairs += [(other, row) for row in local for other in (ranked[0], *floors) if other is not row]
         unique = {frozenset(row.name for row in pair): pair for pair in pairs}
-        made = compare_all([(first.method, second.method) for first, second in unique.values()], self.protocol)
+        made = compare_all([(first.method, second.method) for first, second in unique.values()], self._once)
         return [replace(c, interval=percentiles(self.sampled[c.first] - self.sampled[c.second])) for c in made]
 
     @cached_property
@@ -208,8 +234,11 @@ class Board:
             rows = [row for row in self.of_kind("policy") if row.budget == budget]
             if len(rows) > 1:
                 tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
-                corrected = holm([separation.p for separation in tasks])
-                made += [replace(separation, corrected=p) for separation, p in zip(tasks, corrected, strict=True)]
+                over_policies = holm([separation.p for separation in tasks])
+                repeated = [separation.p_repeated for separation in tasks if separation.p_repeated is not None]
+                over_trainings = holm(repeated) if repeated else [None] * len(tasks)
+                corrected = zip(tasks, over_policies, over_trainings, strict=True)
+                made += [replace(separation, p=p, p_repeated=nested) for separation, p, nested in corrected]
         return made
 
     def _separation(self, budget: str, task: str, rows: Sequence[Row]) -> Separation:
@@ -220,9 +249,12 @@ class Board:
             max((self.success(row, [task]) for row in self.of_kind(kind)), default=None)
             for kind in ("floor", "ceiling")
         )
+        outcomes = [row.outcomes(task) for row in rows]
+        repeated = [of_row for of_row in outcomes if of_row.shape[1] > 1]
         return Separation(
             budget, task, len(rows), float(means.min()), float(means.mean()), float(means.max()),
-            float(max(0, variance)) ** 0.5, noise, floor, ceiling, homogeneity([row.outcomes(task) for row in rows]),
+            float(max(0, variance)) ** 0.5, noise, floor, ceiling, homogeneity(outcomes), len(repeated),
+            homogeneity(repeated) if len(repeated) > 1 else None,
         )  # fmt: skip
 
     @property
@@ -274,7 +306,7 @@ class Board:
             names[1], f"{100 * share:.0f} % of it", f"[{100 * low:.0f}, {100 * high:.0f}]", reached=share <= 0.5
         )
         suites = [(suite, tuple(self.protocol.choose("suite", suite))) for suite in self.protocol.suites]
-        compared = [compare(best.method, matched[0].method, replace(self.protocol, tasks=tasks)) for _, tasks in suites]
+        compared = [compare(best.method, matched[0].method, replace(self._once, tasks=tasks)) for _, tasks in suites]
         intervals = [percentiles(np.subtract(*self.draws([best, matched[0]], tasks))) for _, tasks in suites]
         advantages = [
             Target(

@@ -1,5 +1,7 @@
 """The tables and figures of the board, in the terminal, in Markdown, and as one page with sortable tables."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from mme_vla.errors import listed
@@ -33,8 +35,13 @@ def ranking(board: Board, brief: bool = False) -> Table:
         numbers = [(facts.parameters, ",.0f"), (gflops, ".2f"), (facts.update_s, ".3f"), (facts.cpu_minutes, ".1f")]
         costs = [] if brief else [_cell(value, spec) for value, spec in numbers]
         strong |= {len(rows)} if row.is_local else set()
-        rows.append([row.name, at, trainings, show(row.average), span(board.interval(row)), *cells, *costs])
+        rows.append([row.name, at, trainings, success(board, row), span(board.interval(row)), *cells, *costs])
     return Table(f"Ranking, split {board.split}", columns, rows, strong=strong)
+
+
+def success(board: Board, row: Row) -> str:
+    """A row's success over all tasks ± the deviation between its trainings, in percent."""
+    return show(replace(row.average, mean=board.success(row)))  # rounded, so that equal rows read alike
 
 
 def tasks(board: Board) -> Table:
@@ -47,15 +54,17 @@ def tasks(board: Board) -> Table:
 def separations(board: Board) -> Table:
     """Tasks and budgets at which memories differ, the clearest first."""
     rows = []
-    for s in sorted(board.separations, key=lambda s: (s.corrected, s.p, -s.deviation)):
+    for s in sorted(board.separations, key=lambda s: (s.p, -s.deviation)):
         above, below = (None if end is None else abs(s.mean - end) for end in (s.floor, s.ceiling))
+        over_trainings = "–" if s.p_repeated is None else f"{show_p(s.p_repeated)} ({s.repeated})"
         rows.append([
             s.task, s.budget or "default", str(s.memories), f"{s.lowest:.0f} … {s.mean:.0f} … {s.highest:.0f}",
-            f"{s.deviation:.1f}", _cell(s.noise, ".1f"), show_p(s.corrected), _cell(above, ".0f"), _cell(below, ".0f"),
+            f"{s.deviation:.1f}", _cell(s.noise, ".1f"), show_p(s.p),
+            over_trainings, _cell(above, ".0f"), _cell(below, ".0f"),
         ])  # fmt: skip
-    columns = ["task", "tokens", "memories", "lowest … mean … highest (%)", "spread", "noise", "p", "above the floor",
-               "below the ceiling"]  # fmt: skip
-    return Table("Whether memories differ", columns, rows)
+    columns = ["task", "tokens", "memories", "lowest … mean … highest (%)", "spread", "noise", "p", "p over trainings",
+               "above the floor", "below the ceiling"]  # fmt: skip
+    return Table("Whether memories differ on a task", columns, rows)
 
 
 def separating(board: Board) -> list[str]:
@@ -64,14 +73,17 @@ def separating(board: Board) -> list[str]:
     sentences = []
     for budget in dict.fromkeys(s.budget for s in made):
         here = [s for s in made if s.budget == budget]
-        separated = [s.task for s in here if s.corrected < 0.05]
+        separated = [s.task for s in here if s.p < 0.05]
         tokens = f"At {budget} tokens" if budget else "At the default budgets"
-        rows = [row for row in board.of_kind("policy") if row.budget == budget]
-        compared = "memories" if min(len(row.method.trainings) for row in rows) > 1 else "trained policies"
         names = f": {', '.join(separated)}" if separated else ""
-        sentences.append(
-            f"{tokens} the {len(rows)} {compared} differ in {len(separated)} of {len(here)} tasks (p < 0.05){names}."
-        )
+        memories, repeated = here[0].memories, here[0].repeated
+        sentence = f"{tokens} the {memories} {'memories' if repeated == memories else 'trained policies'} differ in "
+        sentence += f"{len(separated)} of {len(here)} tasks (p < 0.05){names}."
+        if 1 < repeated < memories:
+            over_trainings = [s.task for s in here if s.p_repeated is not None and s.p_repeated < 0.05]
+            names = f" ({', '.join(over_trainings)})" if over_trainings else ""
+            sentence += f" Tested over trainings, the {repeated} with several differ in {len(over_trainings)}{names}."
+        sentences.append(sentence)
     return sentences
 
 
@@ -124,6 +136,9 @@ def notes(board: Board) -> list[str]:
             f"Another training of a row changes its success by {noise:.1f} points (standard deviation). Intervals have "
             f"this noise. Rows of one training: {single}."
         )
+    for row in board.rows:
+        if errors := sum(run.outcomes["error"] for run in row.method.runs):
+            lines.append(f"{row.name}: {errors} episodes ended in an error and count as failures.")
     recordings = frozenset[str]().union(*(row.recordings for row in board.rows))
     if len(recordings) > 1:
         several = sum(len(row.recordings) > 1 for row in board.rows)
@@ -142,7 +157,7 @@ def standing(board: Board) -> list[str]:
         if row.is_local:
             lines.append(
                 f"{row.name}: place {place} of {len(board.ranked)}, between {low:.0f} and {high:.0f} with "
-                f"{100 * board.protocol.confidence:g} % confidence, with {show(row.average)} % "
+                f"{100 * board.protocol.confidence:g} % confidence, with {success(board, row)} % "
                 f"{span(board.interval(row))}."
             )
     return lines

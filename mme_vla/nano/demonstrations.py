@@ -17,6 +17,7 @@ from mme_vla.embodiment.action_space import Option, read_options
 from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import RenderRequest, capture, read_images
+from mme_vla.errors import require
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.utils import parse_json, write_atomically
 
@@ -109,15 +110,34 @@ class Scene:
         return self.path.with_suffix(".failed")
 
     @property
+    def made(self) -> bool:
+        """Whether its demonstration is there; one that failed later, for other frames, does not count."""
+        return self.path.is_file() and not self.failed.is_file()
+
+    @property
     def tried(self) -> bool:
-        """Whether there is nothing left to do: it failed, or is there with every required frame."""
-        return self.failed.is_file() or (self.path.is_file() and self._complete())
+        """Whether there is nothing left to do: it failed, or is there with every required frame.
+
+        Raises:
+            UserError: its file is of other actions, or of motions that were not carried out alike.
+        """
+        return self.failed.is_file() or (self.made and self._complete())
 
     def _complete(self) -> bool:
         with np.load(self.path) as file:
-            exec_start = parse_json(str(file["about"]), str(self.path))["exec_start"]
-            read = [choice.read(file["decisions"][:: choice.every], exec_start) for choice in self.choices]
-            return set().union(*read) <= set(file["front_frames"].tolist())
+            about = parse_json(str(file["about"]), str(self.path))
+            was, width = about.get("carried_out", False), file["targets"].shape[1]
+            required = width if self.acts is None else self.acts.width
+            require(
+                (was, width) == (self.carried_out, required),
+                f"{self.path} holds actions of {width} numbers with carried_out={was}, and this command records "
+                f"{required} with carried_out={self.carried_out}: choose another output.",
+            )
+            decided = [file["decisions"][:: choice.every] for choice in self.choices]
+            read = [choice.read(at, about["exec_start"]) for choice, at in zip(self.choices, decided, strict=True)]
+            seen = {camera: set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist()) for camera in CAMERAS}
+            everywhere = {frame for at in decided for frame in at.tolist()}
+            return set().union(*read) <= seen["front"] and all(everywhere <= seen[camera] for camera in self.cameras)
 
 
 def demonstrated(scene: Scene) -> bool:

@@ -22,7 +22,7 @@ from mme_vla.evaluation.rollout.evaluation import VIDEOS, choose_shard, evaluate
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.nano.demonstrations import Demonstration
-from mme_vla.nano.fitting import DONE, ROW_CONFIG
+from mme_vla.nano.rows import CONFIG, TRAINED
 from mme_vla.play.game import MAX_CHOICES, ChoiceSession
 from mme_vla.play.players import OraclePlayer, Player, RandomPlayer, play
 from mme_vla.policy.base import Policy
@@ -174,9 +174,8 @@ def play_all(
     settings = {**asdict(rules), "model": name, "max_steps": rules.steps}
     del settings["workers"], settings["shard"]
     claim_run(folder, settings)
-    if not (folder / DONE).is_file():
-        write_json(folder / DONE, {"row": name, "kind": KINDS[name], "trained": False, "seed": 0})
-        (folder / ROW_CONFIG).write_text(f"name: {name}\n", encoding="utf-8")
+    (folder / CONFIG).write_text(f"name: {name}\n", encoding="utf-8")
+    write_json(folder / TRAINED, {"row": name, "kind": KINDS[name], "trained": False, "seed": 0})
     file = folder / RECORDS
     known = {record.key for record in (read_records(file) if file.is_file() else ())}
     jobs = [Play(name, spec, rules, moves.get(spec.task, ())) for spec in specs]
@@ -233,11 +232,12 @@ def evaluate_row(
 
     oracle: name of the row in which it is evaluated with the oracle's frames, a ceiling.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy(training / ROW_CONFIG, folder / ROW_CONFIG)
-    about = read_json(training / DONE, "a training's end")
-    write_json(folder / DONE, about if oracle is None else {**about, "row": oracle, "kind": "ceiling"})
-    return run_episodes(checkpoint, folder, specs, rules, oracle=oracle is not None)
+    records = run_episodes(checkpoint, folder, specs, rules, oracle=oracle is not None)
+    # Only then: a folder of other weights was refused, and keeps its files.
+    shutil.copy(training / CONFIG, folder / CONFIG)
+    about = read_json(training / TRAINED, "a training's end")
+    write_json(folder / TRAINED, about if oracle is None else {**about, "row": oracle, "kind": "ceiling"})
+    return records
 
 
 def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord], rules: Rules) -> list[Path]:

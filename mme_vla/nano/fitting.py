@@ -1,5 +1,6 @@
 """One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
 
+import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,10 +17,11 @@ from mme_vla.config.composition import compose, import_plugins, resolved
 from mme_vla.config.naming import digest
 from mme_vla.config.plugins import plugins_of
 from mme_vla.embodiment.action_space import ActionSpace
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, choice_errors, position_error, statistics
+from mme_vla.nano.rows import CONFIG, TRAINED
 from mme_vla.nano.tokens import FrameTokens, TokenStore
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning, copy_tower
@@ -30,11 +32,10 @@ from mme_vla.training.checkpoint import checkpoints_in
 from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.order import Validation
-from mme_vla.training.runs import claim_run
+from mme_vla.training.runs import CHECKPOINTS, METRICS, claim_run, open_run
 from mme_vla.training.settings import TrainSettings
-from mme_vla.utils import read_lines, write_json
+from mme_vla.utils import FolderLock, read_json, read_lines, write_json
 
-DONE, ROW_CONFIG = "trained.json", "config.yaml"
 HELD_OUT = 10  # One demonstration in so many only measures the loss
 
 
@@ -91,14 +92,38 @@ class Training:
     tower_seed: int = 0
 
     @property
+    def full_config(self) -> dict[str, Any]:
+        """All that the trained policy follows from, but for the demonstrations."""
+        return {**self.config, "train": dict(self.settings), "learning": dict(self.learning)}
+
+    @property
+    def demonstrations(self) -> dict[str, int]:
+        """How many of each task."""
+        return dict(Counter(file.parent.name for file in self.files))
+
+    @property
     def done(self) -> bool:
-        """Whether there is nothing left to do."""
-        return (self.folder / DONE).is_file()
+        """Whether there is nothing left to do.
+
+        Raises:
+            UserError: the folder holds a training of other settings, or of other numbers of demonstrations.
+        """
+        if not (self.folder / TRAINED).is_file():
+            return False
+        open_run(self.folder, str(self.folder), self.full_config)
+        about = read_json(self.folder / TRAINED, "a training's end")
+        for key, now in (("steps", self.settings["steps"]), ("demonstrations", self.demonstrations)):
+            require(
+                about[key] == now,
+                f"{self.folder} holds a training with {key}={about[key]}, and this command says {now}: choose another "
+                "output, or move that folder away.",
+            )
+        return True
 
     @property
     def checkpoint(self) -> Path:
         """The last checkpoint of a training that is done."""
-        return checkpoints_in(self.folder / "checkpoints")[-1]
+        return checkpoints_in(self.folder / CHECKPOINTS)[-1]
 
 
 def train_in_process(job: Training) -> Path:
@@ -114,11 +139,13 @@ def train(job: Training) -> Path:
     if job.done:
         return job.checkpoint
     begun, cpu = time.perf_counter(), time.process_time()
-    folder, settings = job.folder, job.settings
+    folder, settings, full_config = job.folder, job.settings, job.full_config
     train_settings = TrainSettings.from_dict(settings, int(job.config["seed"]))
-    full_config = {**job.config, "train": dict(settings), "learning": dict(job.learning)}
-    resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
-    folder.mkdir(parents=True, exist_ok=True)
+    resume = str(folder) if checkpoints_in(folder / CHECKPOINTS) else None
+    if resume is None:
+        with FolderLock(folder, "training run"):  # it may have ended before its first checkpoint
+            (folder / METRICS).unlink(missing_ok=True)
+            shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
     run, lock = claim_run(folder, True, resume, full_config)
     with ExitStack() as resources:
         resources.push(lock)  # it is held already
@@ -152,9 +179,9 @@ def train(job: Training) -> Path:
         "minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60,
     }  # fmt: skip
     learned = MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval()
-    (folder / ROW_CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8")
+    (folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8")
     write_json(
-        folder / DONE, summary(job, learned, len(samples.tasks)) | cost | spent | held_out(learned, val_set, folder)
+        folder / TRAINED, summary(job, learned, len(samples.tasks)) | cost | spent | held_out(learned, val_set, folder)
     )
     return trainer.last_checkpoint
 
@@ -166,7 +193,7 @@ def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
     return {
         "row": job.row, "kind": "policy", "trained": True, "seed": int(job.config["seed"]),
         "steps": job.settings["steps"], "updates": job.settings["steps"], "batch_size": job.settings["batch_size"],
-        "decisions": decisions, "demonstrations": dict(Counter(file.parent.name for file in job.files)),
+        "decisions": decisions, "demonstrations": job.demonstrations,
         **{name: getattr(identity, name) for name in ("data", "recipe", "weights")}, "tower": job.store.tower,
         "memory": memory["name"] if memory else None, "integration": integration["name"] if integration else None,
         "budget": policy.memory.budget if policy.memory is not None else None,

@@ -1,6 +1,7 @@
 """The page of a nano run: success beside its brackets, the paired test, minutes and learning curves."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from mme_vla.evaluation.results.compare import Comparison, common_episodes, comp
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.nano.evaluating import PLANNER
-from mme_vla.nano.fitting import DONE, learning_curve
+from mme_vla.nano.fitting import learning_curve
+from mme_vla.nano.rows import TRAINED
+from mme_vla.nano.runs import counts_of
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
 
@@ -35,7 +38,7 @@ def write_page(
     all others are compared with. minutes: of each stage, on the clock. videos: one of a success, one of a failure,
     as far as there are such. runs: of each model, the folders of its trainings.
     """
-    ends = {model: [read_json(run / DONE, "a training's end") for run in folders] for model, folders in runs.items()}
+    ends = {model: [read_json(run / TRAINED, "a training's end") for run in folders] for model, folders in runs.items()}
     results, comparisons = compared(records, config["task"], config["split"], without)
     curves = {
         model if len(folders) == 1 else f"{model}, {run.name}": learning_curve(run)
@@ -45,7 +48,7 @@ def write_page(
     text = render(
         "nano.md",
         config=config,
-        demonstrations=sum(config["demonstrations"].values()),
+        demonstrations=sum(counts_of(config).values()),
         seeds=str(config["policy_seed"]),
         planner=PLANNER,
         without=without,
@@ -70,7 +73,9 @@ def compared(
     With none without memory: the first model against each other one.
     """
     every = [record for model_records in records.values() for record in model_records]
-    protocol = Protocol((task,), 1 + max(record.episode for record in every))
+    numbers = {episode: number for number, episode in enumerate(sorted({record.episode for record in every}))}
+    every = [replace(record, episode=numbers[record.episode]) for record in every]
+    protocol = Protocol((task,), len(numbers))
     results = aggregate(every, protocol, split)
     methods = {
         model: _method(results, model_records[0]) for model, model_records in records.items() if model != PLANNER

@@ -106,8 +106,8 @@ def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, 
     for training in sorted(trainings, key=lambda training: training.facts.seed):
         name = training.facts.row
         row = rows.setdefault(f"{name} (yours)" if training.is_local and name in names else name, [])
-        if row:
-            _check_alike(row[0], training)
+        for earlier in row:
+            _check_alike(earlier, training)
         row.append(training)
         require(
             training.rules == trainings[0].rules,
@@ -199,7 +199,7 @@ def _numbered(folder: Path, records: Sequence[EpisodeRecord]) -> list[EpisodeRec
     Raises:
         UserError: they are not the first scenes of each task that can be built.
     """
-    file, split = folder.parent.parent / SCENES, records[0].split
+    file, split = folder.resolve().parent.parent / SCENES, records[0].split
     tried = read_json(file, "the scenes of a split").get("tried", {}) if file.is_file() else {}
     n_scenes = max(Counter(record.task for record in records).values())
     by_key = {record.key: record for record in records}

@@ -95,6 +95,7 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
     """Every model at every budget."""
     from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
+    from mme_vla.nano.board import MATCHED
     from mme_vla.nano.fitting import compose_policy
     from mme_vla.nano.learning import check_reflection
 
@@ -105,7 +106,8 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
     require(models, "No row is to be trained: name one, such as model=framesamp_modul.")
     composed: dict[str, dict[str, Any]] = {}
     for model in models:
-        for budget in as_list(config["budget"]):
+        # The floor that reads the current frame alone has the tokens of that frame, at any budget.
+        for budget in [None] if model == MATCHED else as_list(config["budget"]):
             each = compose_policy(model, *how, budget=budget)
             composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = each
     others = [compose_policy(model, *how) for model in config["drawn_for"] if model not in models]
@@ -282,9 +284,9 @@ class Group:
 
     def take(self, tried: Sequence["Scene"]) -> None:
         """Note what came of them."""
-        new = [scene.path for scene in tried if scene.path.is_file()]
+        new = [scene.path for scene in tried if scene.made]
         for scene in tried:
-            if not scene.path.is_file():
+            if not scene.made:
                 logger.info("left out: %s, seed %d, %s", scene.task, scene.seed, scene.difficulty)
         self.files += new
         self.failed = 0 if new else self.failed + len(tried)
@@ -308,7 +310,7 @@ def demonstrate(groups: Sequence[Group], workers: int = 1) -> list[Path]:
             # In turn, so that an interrupted run has some of every group.
             alternating = [scene for scenes in zip_longest(*tried) for scene in scenes if scene is not None]
             missing = [scene for scene in alternating if not scene.tried]
-            advance(sum(scene.path.is_file() for scene in alternating if scene.tried))
+            advance(sum(scene.made for scene in alternating if scene.tried))
             for made in carry_out(missing, demonstrated, workers):
                 advance(int(made))
             for group, scenes in zip(lacking, tried, strict=True):

@@ -174,7 +174,7 @@ def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> No
     first = made[0]
     assert (first.lowest, first.highest, first.ceiling) == pytest.approx((100 / 3, 500 / 6, 100))
     assert first.floor == pytest.approx(100 / 3) and made[1].floor == 0
-    assert first.noise == pytest.approx(board.noise()) and first.corrected >= first.p
+    assert first.noise == pytest.approx(board.noise()) and first.repeated == 3 and first.p == first.p_repeated
     assert board_page.separating(board)[0].startswith("At the default budgets the 3 memories differ in 0 of 4 tasks")
 
 
@@ -394,3 +394,34 @@ def test_a_model_is_trained_before_the_board_is_made(
     with pytest.raises(SystemExit):
         board_command.main([f"split={SPLIT}"], train, nano_command.with_settings)
     assert len(typed) == 1 and "There are no rows" in capsys.readouterr().err
+
+
+def test_two_trainings_of_one_seed_are_refused_wherever_they_stand(tmp_path: Path) -> None:
+    for folder, seed in (("a", 0), ("a", 1), ("b", 1)):
+        write_training(tmp_path / folder, "mine", seed, 1)
+    with pytest.raises(UserError, match="same seed or weights"):
+        read_rows([tmp_path / "a", tmp_path / "b"])
+
+
+def test_a_row_is_read_from_its_own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_training(tmp_path, "mine", 0, 1)
+    monkeypatch.chdir(folder.parent)
+    assert list(read_rows([Path()])) == ["mine"]
+
+
+def test_errors_of_episodes_are_counted_beside_the_table(rows: Path, tmp_path: Path) -> None:
+    folder = write_training(tmp_path, "mine", 0, 1)
+    write_records(folder, [replace(r, outcome="error") if not r.episode else r for r in records_of(folder)])
+    board = Board(read_rows([rows], local=[tmp_path]), samples=50)
+    assert f"mine: {len(TASKS)} episodes ended in an error and count as failures." in board_page.notes(board)
+
+
+def test_a_trained_row_without_memory_is_a_floor_under_any_name(rows: Path, tmp_path: Path) -> None:
+    write_training(tmp_path, "wide_pi05", 0, 3, budget=None)
+    board = Board(read_rows([rows, tmp_path]), samples=50)
+    assert row_of(board, "wide_pi05").kind == "floor" and "(framesamp_modul)" in board.targets()[0].measured
+
+
+def test_a_row_that_solves_every_scene_has_an_interval(board: Board) -> None:
+    low, high = board.interval(row_of(board, "demonstrator"))
+    assert low < 90 and high == pytest.approx(100)

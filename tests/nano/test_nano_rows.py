@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,18 +11,21 @@ import torch
 
 from helpers.nano_policies import demonstration
 from mme_vla import UserError, build_policy
+from mme_vla.config.composition import compose, resolved
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.nano import demonstrations, tokens
 from mme_vla.nano.demonstrations import Demonstration, Scene
-from mme_vla.nano.fitting import DONE
 from mme_vla.nano.learning import Decisions, position_error, statistics
 from mme_vla.nano.page import write_page
+from mme_vla.nano.rows import TRAINED
 from mme_vla.nano.runs import Group, demonstrate
 from mme_vla.nano.tokens import TokenStore
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.utils import write_json
 
+CHOOSES = embodiment_of(resolved(compose("policy", ["embodiment=robomme_choice_front"]))).action
 SMALL = {"framesamp": {"every": 8}, "tokendrop": {"stride": 8}, "ttt": {"stride": 16}, "rmt": {"stride": 16}}
 
 
@@ -152,6 +156,30 @@ def test_scenes_are_demonstrated_until_there_are_enough_and_once(
     other_memory = FrameChoice(DECISIONS, {"name": "framesamp", "budget": 4, "grid": 1, "every": 4})
     demonstrated(1, other_memory)
     assert tried == [0, 1, 2, 3, 0], "a demonstration without the frames of a new memory is made again"
+    (tmp_path / "easy-2.failed").touch()
+    assert [path.stem for path in demonstrated(2)] == ["easy-0", "easy-3"], "the new try of the second one failed"
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [({"carried_out": True}, "carried_out=False.*choose another output"), ({"acts": CHOOSES}, "7 numbers .* 10")],
+)
+def test_demonstrations_of_other_actions_are_not_taken_for_what_is_recorded(
+    how: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    (scene,) = scenes(tmp_path, 1)
+    demonstration().save(scene.path)
+    assert scene.tried
+    with pytest.raises(UserError, match=message):
+        replace(scene, **how).tried  # noqa: B018
+
+
+def test_a_demonstration_without_a_cameras_images_is_made_again(tmp_path: Path) -> None:
+    (scene,) = scenes(tmp_path, 1, FrameChoice(DECISIONS))
+    made = demonstration()
+    made.save(scene.path)
+    assert scene.tried
+    assert not replace(scene, cameras=("front", "wrist")).tried
 
 
 def test_scene_after_scene_without_a_demonstration_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,16 +191,17 @@ def test_scene_after_scene_without_a_demonstration_is_reported(tmp_path: Path, m
 def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Path) -> None:
     def records(model: str, won: int, count: int, budget: int | None = None) -> list[EpisodeRecord]:
         return [
-            EpisodeRecord(model, 1, 7, "VideoUnmask", n, n, "easy", "success" if n < won else "timeout", 9,
+            EpisodeRecord(model, 1, 7, "VideoUnmask", 2 * n, n, "easy", "success" if n < won else "timeout", 9,
                           split="further", memory_budget=budget) for n in range(count)
         ]  # fmt: skip
 
     for model in ("framesamp_modul", "pi05", "ttt_modul"):
         (tmp_path / model).mkdir()
-        write_json(tmp_path / model / DONE, {"off_by_m": [0.01, 0.02, 0.05]})
+        write_json(tmp_path / model / TRAINED, {"off_by_m": [0.01, 0.02, 0.05]})
         (tmp_path / model / "metrics.jsonl").write_text('{"step": 10, "val/loss": 0.5}\n')
     config = {
-        "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4}, "train": {"steps": 20},
+        "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4},
+        "demonstrations_of": {"VideoUnmask": {"hard": 3}}, "train": {"steps": 20},
         "policy_seed": 7,
     }  # fmt: skip
     video = tmp_path / "films" / "a.mp4"
@@ -186,4 +215,5 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
     assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page
     assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
+    assert page.count("Incomplete") == 1 and "7 demonstrations" in page
     assert "| videos | 2.0 |" in page and (tmp_path / "learning.png").is_file()

@@ -1,5 +1,6 @@
 """A sweep over memories, budgets and trainings is one run: demonstrations and tokens once, one table."""
 
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from mme_vla.cli.nano import with_settings
 from mme_vla.config.composition import compose, resolved
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.nano import evaluating, fitting, runs, tokens
 from mme_vla.nano.demonstrations import Demonstration
@@ -47,7 +49,8 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     original = tokens.tokenize
     monkeypatch.setattr(tokens, "tokenize", lambda *args: made.append(args) or original(*args))
 
-    def episodes(checkpoint: Path, *_: Any, **__: Any) -> list[EpisodeRecord]:
+    def episodes(checkpoint: Path, folder: Path, *_: Any, **__: Any) -> list[EpisodeRecord]:
+        folder.mkdir(parents=True, exist_ok=True)
         policy = MMEPolicy.from_pretrained(str(checkpoint))
         return [
             EpisodeRecord(str(policy.config["name"]), 2, 7, "VideoUnmask", n, n, "easy", "success" if n else "fail", 9,
@@ -72,6 +75,14 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     assert about["demonstrations"] == {"VideoUnmask": 2} and about["parameters"] > 1e6 and about["update_flops"] > 1e6
     runs.run(resolved(compose("nano", words)))
     assert len(made) == 2, "a finished run is not made again"
+    for changed, message in (("train.steps=3", "steps=2, and this command says 3"), ("learning.noise=0.5", "noise")):
+        with pytest.raises(UserError, match=message):
+            runs.run(resolved(compose("nano", [*words, changed])))
+    killed = tmp_path / "run" / "training" / "framesamp_modul@2" / "0"
+    (killed / "trained.json").unlink()
+    shutil.rmtree(killed / "checkpoints")  # as before the first one: there are only lines of progress
+    runs.run(resolved(compose("nano", words)))
+    assert read_json(killed / "trained.json", "a training's end")["steps"] == 2
 
 
 def test_minutes_of_a_stage_add_up_over_runs(tmp_path: Path) -> None:
