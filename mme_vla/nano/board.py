@@ -54,7 +54,7 @@ class Row:
         if self.method.subgoal == "oracle":
             return "ceiling"
         lacks_memory = self.facts.trained and self.facts.budget is None and self.method.subgoal is None
-        return "floor" if lacks_memory or self.name.partition(" ")[0] == MATCHED else self.facts.kind
+        return "floor" if lacks_memory or self.name.partition(" ")[0].partition("@")[0] == MATCHED else self.facts.kind
 
     @property
     def average(self) -> Figure:
