@@ -268,7 +268,8 @@ class Board:
     def agreements(self) -> list[Agreement]:
         """Rank correlations with the published success over all tasks, of memories alone, by suite and by task.
 
-        None below three rows, and where all are equal. Intervals are of `draws`; published figures are fixed.
+        Scopes with fewer than three rows, or where all are equal, are left out. Intervals are of `draws`. Published
+        figures are fixed.
         """
         memories = [(row, method) for row, method in self.published if row.kind == "policy"]
         named = [(s.kind, s.name, s.tasks) for s in scopes(self.protocol) if s.kind in ("average", "suite", "task")]

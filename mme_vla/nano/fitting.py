@@ -174,9 +174,11 @@ def train(job: Training) -> Path:
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
     updates = train_settings.steps - run.step
+    whole = not run.step  # what an interrupted training took before is not known
     spent = {
         "update_s": (time.process_time() - updating) / updates if updates else None,
-        "minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60,
+        "minutes": (time.perf_counter() - begun) / 60 if whole else None,
+        "cpu_minutes": (time.process_time() - cpu) / 60 if whole else None,
     }  # fmt: skip
     learned = MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval()
     (folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8")

@@ -37,7 +37,8 @@ class Trained:
 
     row: name of the row. kind: floors and ceilings bracket the policies. trained: whether there was a training. seed,
     recipe, data, weights: its `TrainingIdentity`. demonstrations: their number for each task. budget: memory tokens.
-    parameters: learned ones. update_s, update_flops: of one update. cpu_minutes: of the training.
+    parameters: learned ones. update_s: CPU seconds of one update, with its share of validation and checkpoints.
+    update_flops: of one update. cpu_minutes: of a training that was not interrupted.
     """
 
     row: str
