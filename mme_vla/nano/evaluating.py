@@ -47,7 +47,8 @@ class Rules:
 
     seed: of a policy's noise. max_steps: control steps until the outcome is timeout; 0: as many as the split allows.
     max_choices: actions until it is; None: no limit for policies, `MAX_CHOICES` for rows without a training.
-    only_possible: offer no option whose every object is out of reach. shard: which of several processes this is, `0/2` or `1/2`; None: the only one.
+    only_possible: offer no option whose every object is out of reach.
+    shard: which of several processes this is, `0/2` or `1/2`; None: the only one.
     """
 
     split: str = "test"
