@@ -13,7 +13,6 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import printable
-from mme_vla.nano.runs import as_list
 
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
@@ -38,21 +37,28 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
         args = parser.parse_intermixed_args(words)
         words = [word for word in args.words if not word.startswith("rows=")]
         trees = [args.config_dir] if args.config_dir else []
-        config = resolved(compose("nano", with_settings(words), extra_dirs=trees))
+        config = compose("nano", with_settings(words), extra_dirs=trees)
         trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
             sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
             nano()
-            trained = rows_of(config)
-        run(args, config["split"], trained)
+            trained = rows_of(resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees)
+        run(args, str(config.split), trained)
 
 
-def rows_of(config: Mapping[str, Any]) -> list[Path]:
-    """The folders of the rows that were trained: of the models that are named, at each budget."""
-    folder = Path(config["output"]) / config["split"]
-    models, budgets = as_list(config["with_memory"]), as_list(config["budget"])
-    rows = [folder / f"{model}@{budget}" for model in models for budget in budgets]
-    return [row if row.is_dir() else row.with_name(row.name.partition("@")[0]) for row in rows]
+def rows_of(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
+    """The folders of the rows of a run; others that its output holds may be unfinished."""
+    from mme_vla.nano.evaluating import DEMONSTRATOR, FREQUENT, ORACLE_FRAMES, PLANNER, RANDOM
+    from mme_vla.nano.runs import compose_rows
+
+    names = list(compose_rows(config, trees).composed)
+    names += [
+        row.replace(config["oracle"], ORACLE_FRAMES) for row in names if row.partition("@")[0] == config["oracle"]
+    ]
+    names += [DEMONSTRATOR, PLANNER] if config["planner"] else []
+    names += [RANDOM, FREQUENT] if config["floors"] else []
+    folders = [Path(config["output"]) / config["split"] / name for name in names]
+    return [folder for folder in folders if folder.is_dir()]
 
 
 def alone(words: Sequence[str]) -> list[str]:

@@ -4,10 +4,12 @@ Scenes are the same for all rows. Means are over tasks. Intervals come from a bo
 between trainings that the rows show together. P values are of the trained policies, on these scenes.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from math import factorial, prod
 
 import numpy as np
 
@@ -63,7 +65,7 @@ class Row:
     @property
     def budget(self) -> str:
         """The memory tokens in the row's name; empty for the default."""
-        return self.name.partition("@")[2]
+        return self.name.partition(" ")[0].partition("@")[2]
 
     @property
     def paper(self) -> PaperMethod | None:
@@ -87,8 +89,9 @@ class Separation:
 
     memories: how many. lowest, mean, highest: of their success. deviation: standard one between memories, less what
     trainings add. noise: between trainings of one memory, None with one training each. floor, ceiling: of the best
-    floor and of the best ceiling. p: of `homogeneity`. repeated: how many memories have several trainings. p_repeated:
-    of these alone, None below two. Both are corrected by Holm over the tasks of the budget.
+    floor and of the best ceiling. p: of `homogeneity` of all policies. repeated: how many memories have several
+    trainings. p_repeated: of these over trainings, None where they are too few for a p below 0.05. Both are corrected
+    by Holm over the tasks of the budget.
     """
 
     budget: str
@@ -166,27 +169,28 @@ class Board:
     def draws(self, rows: Sequence[Row], tasks: Sequence[str]) -> np.ndarray:
         """Bootstrap of the rows' success over tasks [rows, samples], in percent, on the same scenes for all.
 
-        The mean of n trainings has normal noise of 1/√n of the deviation between trainings, which all rows share: a row
-        has too few to draw its own. That deviation is `noise` without the luck of episodes, which the scenes bring.
+        The mean of n trainings has normal noise of 1/√n of the deviation between trainings: of all rows, or the row's
+        own where that is larger, without the luck of episodes, which the scenes bring.
         """
         values = {task: [row.outcomes(task).mean(1, keepdims=True) for row in rows] for task in tasks}
         means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
-        noise = max(0.0, (self.noise(tasks) or 0.0) ** 2 - self._luck(tasks)) ** 0.5
-        rng = np.random.default_rng([self.protocol.seed, 2])
+        rng, shared = np.random.default_rng([self.protocol.seed, 2]), self._beyond_luck(self.rows, tasks)
         for row, sampled in zip(rows, means, strict=True):
             if row.facts.trained:
-                sampled += rng.normal(0, noise / len(row.method.trainings) ** 0.5, len(sampled))
+                deviation = max(shared, self._beyond_luck([row], tasks))
+                sampled += rng.normal(0, deviation / len(row.method.trainings) ** 0.5, len(sampled))
         return means.clip(0, 100).round(9)
 
-    def _luck(self, tasks: Sequence[str]) -> float:
-        """Variance of a training's success over tasks, in percent², by episodes that end otherwise on their own."""
-        repeated = [row for row in self.rows if len(row.method.trainings) > 1]
-        degrees = [len(row.method.trainings) - 1 for row in repeated]
+    def _beyond_luck(self, rows: Sequence[Row], tasks: Sequence[str]) -> float:
+        """Deviation of success between trainings of a row, less that of episodes which end otherwise on their own."""
+        repeated = [row for row in rows if len(row.method.trainings) > 1]
         if not repeated:
             return 0.0
-        spread = [[row.outcomes(task).var(1, ddof=1).sum() for task in tasks] for row in repeated]
-        of_rows = np.sum(spread, 1) * (100 / len(tasks) / self.protocol.episodes) ** 2
-        return float(np.average(of_rows, weights=degrees))
+        noise = pooled([row.mean(tasks) for row in repeated]) or 0.0
+        spread = [sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks) for row in repeated]
+        degrees = [len(row.method.trainings) - 1 for row in repeated]
+        luck = np.average(spread, weights=degrees) * (100 / len(tasks) / self.protocol.episodes) ** 2
+        return float(max(0.0, noise**2 - luck) ** 0.5)
 
     @cached_property
     def sampled(self) -> dict[str, np.ndarray]:
@@ -251,10 +255,11 @@ class Board:
         )
         outcomes = [row.outcomes(task) for row in rows]
         repeated = [of_row for of_row in outcomes if of_row.shape[1] > 1]
+        testable = smallest_p([of_row.shape[1] for of_row in repeated]) * len(self.protocol.tasks) < 0.05
         return Separation(
             budget, task, len(rows), float(means.min()), float(means.mean()), float(means.max()),
             float(max(0, variance)) ** 0.5, noise, floor, ceiling, homogeneity(outcomes), len(repeated),
-            homogeneity(repeated) if len(repeated) > 1 else None,
+            homogeneity(repeated, over_trainings=True) if testable else None,
         )  # fmt: skip
 
     @property
@@ -347,12 +352,19 @@ def pooled(groups: Sequence[np.ndarray]) -> float | None:
     return (squares / degrees) ** 0.5 if degrees else None
 
 
-def homogeneity(groups: Sequence[np.ndarray], permutations: int = PERMUTATIONS, seed: int = 0) -> float:
+def smallest_p(sizes: Sequence[int]) -> float:
+    """The smallest p that memories of so many trainings can have: 1 / the number of ways to deal out the trainings."""
+    alike = [factorial(count) for count in Counter(sizes).values()]  # memories of as many trainings may change places
+    return prod(map(factorial, sizes)) * prod(alike) / factorial(sum(sizes))
+
+
+def homogeneity(
+    groups: Sequence[np.ndarray], permutations: int = PERMUTATIONS, seed: int = 0, over_trainings: bool = False
+) -> float:
     """P that memories which do not differ would differ as much: a permutation test of the variance between them.
 
-    groups: of each memory, outcomes [scenes, trainings]. Where every memory has several trainings, trainings change
-    places between memories: they are what another training would change. Otherwise outcomes do within each scene, which
-    tests these policies alone.
+    groups: of each memory, outcomes [scenes, trainings]. over_trainings: trainings change places between memories: they
+    are what another training would change. Otherwise outcomes do within each scene, which tests these policies alone.
     """
     outcomes = np.concatenate(groups, 1)  # scenes × trainings of all memories
     sizes = [group.shape[1] for group in groups]
@@ -363,7 +375,7 @@ def homogeneity(groups: Sequence[np.ndarray], permutations: int = PERMUTATIONS, 
         """Of the memories' means, from trainings' means [..., trainings]."""
         return (np.add.reduceat(means, starts, -1) ** 2 / sizes).sum(-1)
 
-    if min(sizes) > 1:
+    if over_trainings:
         permuted = rng.permuted(np.tile(outcomes.mean(0), (permutations, 1)), axis=1)
     else:
         permuted = np.zeros((permutations, outcomes.shape[1]))

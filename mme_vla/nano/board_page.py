@@ -73,16 +73,17 @@ def separating(board: Board) -> list[str]:
     sentences = []
     for budget in dict.fromkeys(s.budget for s in made):
         here = [s for s in made if s.budget == budget]
-        separated = [s.task for s in here if s.p < 0.05]
         tokens = f"At {budget} tokens" if budget else "At the default budgets"
+        separated = [s.task for s in here if s.p < 0.05]
         names = f": {', '.join(separated)}" if separated else ""
-        memories, repeated = here[0].memories, here[0].repeated
-        sentence = f"{tokens} the {memories} {'memories' if repeated == memories else 'trained policies'} differ in "
-        sentence += f"{len(separated)} of {len(here)} tasks (p < 0.05){names}."
-        if 1 < repeated < memories:
-            over_trainings = [s.task for s in here if s.p_repeated is not None and s.p_repeated < 0.05]
-            names = f" ({', '.join(over_trainings)})" if over_trainings else ""
-            sentence += f" Tested over trainings, the {repeated} with several differ in {len(over_trainings)}{names}."
+        sentence = f"{tokens} the {here[0].memories} trained policies differ in {len(separated)} of {len(here)} tasks "
+        sentence += f"(p < 0.05){names}."
+        if here[0].p_repeated is not None:
+            separated = [s.task for s in here if s.p_repeated is not None and s.p_repeated < 0.05]
+            names = f": {', '.join(separated)}" if separated else ""
+            sentence += (
+                f" Tested over trainings, the {here[0].repeated} with several differ in {len(separated)}{names}."
+            )
         sentences.append(sentence)
     return sentences
 
@@ -123,7 +124,7 @@ def targets(board: Board) -> Table:
 def notes(board: Board) -> list[str]:
     """What a reader of the tables has to know."""
     noise = board.noise()
-    single = sum(row.facts.trained and len(row.method.trainings) == 1 for row in board.ranked)
+    single = sum(row.facts.trained and len(row.method.trainings) == 1 for row in board.rows)
     actions = "" if board.action_space == CHOICES else f" Actions are `{board.action_space}`, not choices."
     lines = [
         f"{len(board.protocol.tasks)} tasks × {board.protocol.episodes} scenes of split `{board.split}`, the same for "
@@ -133,8 +134,8 @@ def notes(board: Board) -> list[str]:
         lines.append("No row has two trainings: the noise between trainings is unknown, and intervals are too narrow.")
     else:
         lines.append(
-            f"Another training of a row changes its success by {noise:.1f} points (standard deviation). Intervals have "
-            f"this noise. Rows of one training: {single}."
+            f"Another training of a row changes its success by {noise:.1f} points (standard deviation). Intervals are "
+            f"over scenes and trainings. Rows of one training: {single}."
         )
     for row in board.rows:
         if errors := sum(run.outcomes["error"] for run in row.method.runs):

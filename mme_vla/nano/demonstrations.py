@@ -137,7 +137,8 @@ class Scene:
             read = [choice.read(at, about["exec_start"]) for choice, at in zip(self.choices, decided, strict=True)]
             seen = {camera: set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist()) for camera in CAMERAS}
             everywhere = {frame for at in decided for frame in at.tolist()}
-            return set().union(*read) <= seen["front"] and all(everywhere <= seen[camera] for camera in self.cameras)
+            remembered = set[int]().union(*read) if "front" in self.cameras else set()
+            return remembered <= seen["front"] and all(everywhere <= seen[camera] for camera in self.cameras)
 
 
 def demonstrated(scene: Scene) -> bool:

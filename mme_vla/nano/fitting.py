@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from mme_vla.config.composition import compose, import_plugins, resolved
 from mme_vla.config.naming import digest
 from mme_vla.config.plugins import plugins_of
+from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import ActionSpace
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, choice_errors, position_error, statistics
@@ -28,11 +30,11 @@ from mme_vla.policy.finetune import apply_finetuning, copy_tower
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import identify, identity_of
-from mme_vla.training.checkpoint import checkpoints_in
+from mme_vla.training.checkpoint import checkpoints_in, read_state
 from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.order import Validation
-from mme_vla.training.runs import CHECKPOINTS, METRICS, claim_run, open_run
+from mme_vla.training.runs import CHECKPOINTS, METRICS, changed_settings, check_content, claim_run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.utils import FolderLock, read_json, read_lines, write_json
 
@@ -93,31 +95,34 @@ class Training:
 
     @property
     def full_config(self) -> dict[str, Any]:
-        """All that the trained policy follows from, but for the demonstrations."""
-        return {**self.config, "train": dict(self.settings), "learning": dict(self.learning)}
-
-    @property
-    def demonstrations(self) -> dict[str, int]:
-        """How many of each task."""
-        return dict(Counter(file.parent.name for file in self.files))
+        """All that the trained policy follows from, with digests of the demonstrations as `data.content`."""
+        content = content_of(self.files, Embodiment.from_dict(self.config["embodiment"]).action)
+        sections = {"train": dict(self.settings), "learning": dict(self.learning), "data": {"content": content}}
+        return {**self.config, **sections}
 
     @property
     def done(self) -> bool:
         """Whether there is nothing left to do.
 
         Raises:
-            UserError: the folder holds a training of other settings, or of other numbers of demonstrations.
+            UserError: the folder holds a training of other settings or on other demonstrations.
         """
         if not (self.folder / TRAINED).is_file():
             return False
-        open_run(self.folder, str(self.folder), self.full_config)
+        now, then = self.full_config, read_state(self.checkpoint)["config"]
+        changed = changed_settings(then, now)
+        if then["train"]["steps"] != now["train"]["steps"]:
+            changed["train.steps"] = (then["train"]["steps"], now["train"]["steps"])
         about = read_json(self.folder / TRAINED, "a training's end")
-        for key, now in (("steps", self.settings["steps"]), ("demonstrations", self.demonstrations)):
-            require(
-                about[key] == now,
-                f"{self.folder} holds a training with {key}={about[key]}, and this command says {now}: choose another "
-                "output, or move that folder away.",
-            )
+        data = identify(now, now["data"]["content"])["data"]
+        if about["data"] != data:
+            changed["the demonstrations' digest"] = (about["data"], data)
+        require(
+            not changed,
+            f"{self.folder} holds a training with other settings: "
+            + listed(f"{key} was {brief(old)}, and is {brief(new)}" for key, (old, new) in changed.items())
+            + ". Choose another output, or move that folder away.",
+        )
         return True
 
     @property
@@ -149,11 +154,13 @@ def train(job: Training) -> Path:
     run, lock = claim_run(folder, True, resume, full_config)
     with ExitStack() as resources:
         resources.push(lock)  # it is held already
+        if run.checkpoint is not None:
+            check_content(run.checkpoint, full_config["data"]["content"])
         policy = build(job.config)
         if job.tower_seed != int(job.config["seed"]):
             copy_tower(build({**job.config, "seed": job.tower_seed}), policy)
         samples, val_set = prepared(policy, job)
-        policy.config[TRAINING] = identify(full_config, content_of(job.files, policy.embodiment.action))
+        policy.config[TRAINING] = identify(full_config, full_config["data"]["content"])
         policy.config["card"] = {"data": f"{len(job.files)} demonstrations", "recipe": dict(settings)}
         validation = Validation(
             val_set, val_set.collate, train_settings.val_samples, train_settings.batch_size, train_settings.seed
@@ -195,7 +202,7 @@ def summary(job: Training, policy: MMEPolicy, decisions: int) -> dict[str, Any]:
     return {
         "row": job.row, "kind": "policy", "trained": True, "seed": int(job.config["seed"]),
         "steps": job.settings["steps"], "updates": job.settings["steps"], "batch_size": job.settings["batch_size"],
-        "decisions": decisions, "demonstrations": job.demonstrations,
+        "decisions": decisions, "demonstrations": dict(Counter(file.parent.name for file in job.files)),
         **{name: getattr(identity, name) for name in ("data", "recipe", "weights")}, "tower": job.store.tower,
         "memory": memory["name"] if memory else None, "integration": integration["name"] if integration else None,
         "budget": policy.memory.budget if policy.memory is not None else None,
@@ -231,16 +238,21 @@ def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
     States and poses are left out: they differ in their last bits between processors. A demonstration that ends
     otherwise on another processor has another digest.
     """
+    return list(_content(tuple(files), tuple(acts.choice)))
+
+
+@lru_cache(maxsize=1)  # of the demonstrations of a run, which all its trainings share
+def _content(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, ...]:
     digests = []
     for file in files:
         made = Demonstration.load(file, images=False)
         targets = made.motions.targets
-        letters = targets[:, list(acts.choice)].argmax(1).tolist() if acts.choice else None
+        letters = targets[:, list(choice)].argmax(1).tolist() if choice else None
         facts = {"decisions": len(targets), "letters": letters}
         facts |= {name: getattr(made, name) for name in ("task", "seed", "difficulty", "goal")}
         facts |= {"carried_out": True} if made.carried_out else {}  # others keep the digest they had without it
         digests.append(digest(facts, 64))
-    return digests
+    return tuple(digests)
 
 
 def prepared(policy: MMEPolicy, job: Training) -> tuple[Decisions, Decisions]:

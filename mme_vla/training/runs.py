@@ -102,7 +102,7 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     if checkpoint is None:
         return Run(folder)
     state = read_state(checkpoint)
-    changed = differing_keys(_completed(state["config"]), _completed(config))
+    changed = changed_settings(state["config"], config)
     if changed:
         pairs = [
             f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now" for key, (old, new) in changed.items()
@@ -141,6 +141,11 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
             "data.sources holds other episodes, so continuing would be another run. Bring the data back, or start anew "
             f"with init_from={checkpoint}."
         )
+
+
+def changed_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Dotted keys that a run may not change, with their values before and now, of two plain configurations."""
+    return differing_keys(_completed(before), _completed(now))
 
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

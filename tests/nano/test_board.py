@@ -19,7 +19,7 @@ from mme_vla.cli import nano as nano_command
 from mme_vla.envs.metadata import episodes
 from mme_vla.evaluation.store import claim_run, read_folders
 from mme_vla.nano import board_page
-from mme_vla.nano.board import Board, Row, homogeneity, kendall, pooled, spearman
+from mme_vla.nano.board import Board, Row, homogeneity, kendall, pooled, smallest_p, spearman
 from mme_vla.nano.rows import read_rows, read_training
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import write_json
@@ -88,7 +88,7 @@ def test_intervals_have_the_noise_of_a_rows_number_of_trainings(
     for row, seed in (("one", 0), ("four", 0), ("four", 1), ("four", 2), ("four", 3)):
         write_training(tmp_path, row, seed, half)
     write_training(tmp_path, "random", 0, half, "floor", trained=False, parameters=None, update_s=None)
-    monkeypatch.setattr(Board, "noise", lambda *_: 4.0)
+    monkeypatch.setattr(Board, "_beyond_luck", lambda *_: 4.0)
     board = Board(read_rows([tmp_path]))
     deviations = {name: draws.std() for name, draws in board.sampled.items()}
     assert deviations == pytest.approx({"one": 4, "four": 2, "random": 0}, rel=0.1)
@@ -96,7 +96,6 @@ def test_intervals_have_the_noise_of_a_rows_number_of_trainings(
     assert (low, high) == pytest.approx((50 - 1.96 * 4, 50 + 1.96 * 4), abs=1)
     (difference,) = (c.interval for c in board.neighbours() if {c.first, c.second} == {"one", "four"})
     assert difference.high - difference.low == pytest.approx(2 * 1.96 * 20**0.5, rel=0.1)
-    assert "trained policies differ in" in board_page.separating(board)[0]
 
 
 def test_policies_that_read_the_simulators_subgoals_are_ceilings(rows: Path, tmp_path: Path) -> None:
@@ -146,7 +145,7 @@ def test_targets_have_intervals_and_are_not_reached_by_weak_evidence(board: Boar
 def test_tasks_that_separate_memories_stand_out() -> None:
     rng = np.random.default_rng(0)
     apart = [np.tile((np.arange(20) < n)[:, None], (1, 3)).astype(float) for n in (2, 6, 10, 14, 18)]
-    assert homogeneity(apart, 999) == pytest.approx(0.001)
+    assert homogeneity(apart, 999) == pytest.approx(0.001) == homogeneity(apart, 999, over_trainings=True)
     alike = [rng.random((20, 3)) < 0.5 for _ in range(5)]
     assert homogeneity(alike, 999) > 0.05
     assert homogeneity([group[:, :1] for group in apart], 999) == pytest.approx(0.001)
@@ -159,12 +158,13 @@ def test_no_false_alarm_where_trainings_differ_as_much_as_memories() -> None:
     rng = np.random.default_rng(1)
     trainings = [np.tile((np.arange(20) < n)[:, None], 1).astype(float) for n in rng.permutation(np.arange(1, 19))]
     groups = [np.concatenate(trainings[i : i + 3], 1) for i in range(0, 18, 3)]
-    assert homogeneity(groups, 999) > 0.05
+    assert homogeneity(groups, 999, over_trainings=True) > 0.05
 
 
 def test_the_homogeneity_test_keeps_its_level() -> None:
     rng = np.random.default_rng(2)
-    p_values = [homogeneity([rng.random((6, 2)) < 0.5 for _ in range(4)], 99, seed) for seed in range(200)]
+    p_values = [homogeneity([rng.random((6, 2)) < 0.5 for _ in range(4)], 99, seed, seed % 2 == 0)
+                for seed in range(200)]  # fmt: skip
     assert 0.01 < np.mean(np.array(p_values) <= 0.05) < 0.1
 
 
@@ -174,8 +174,8 @@ def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> No
     first = made[0]
     assert (first.lowest, first.highest, first.ceiling) == pytest.approx((100 / 3, 500 / 6, 100))
     assert first.floor == pytest.approx(100 / 3) and made[1].floor == 0
-    assert first.noise == pytest.approx(board.noise()) and first.repeated == 3 and first.p == first.p_repeated
-    assert board_page.separating(board)[0].startswith("At the default budgets the 3 memories differ in 0 of 4 tasks")
+    assert first.noise == pytest.approx(board.noise()) and first.repeated == 3 and first.p_repeated is None
+    assert board_page.separating(board)[0].endswith("the 3 trained policies differ in 0 of 4 tasks (p < 0.05).")
 
 
 def test_budgets_are_separate_tables(rows: Path, tmp_path: Path) -> None:
@@ -383,14 +383,16 @@ def test_a_model_is_trained_before_the_board_is_made(
 
     def train() -> None:
         typed.append(sys.argv[1:])
-        write_training(tmp_path / SPLIT, "mine_modul", 0, 2)
+        for row in ("framesamp_modul", "pi05", "of_another_command"):
+            write_training(tmp_path / SPLIT, row, 0, 2, budget=None if row == "pi05" else 32)
 
     monkeypatch.setattr(sys, "argv", ["mme-vla nano", "board"])
     monkeypatch.setattr(board_command, "SHIPPED", tmp_path / "none")
-    words = ["task=VideoUnmask", "model=mine_modul", f"split={SPLIT}", f"output={tmp_path}", "beside=[pi05]"]
+    words = ["task=VideoUnmask", "model=framesamp_modul", f"split={SPLIT}", f"output={tmp_path}", "beside=[pi05]"]
     board_command.main([*words, "--samples", "50"], train, nano_command.with_settings)
     assert typed == [[*words, "planner=false", "oracle=null", "floors=false", "trainings=1"]]
-    assert "mine_modul: place 1 of 1" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "framesamp_modul: place 1 of 2" in printed and "pi05: place 1 of 2" in printed
     with pytest.raises(SystemExit):
         board_command.main([f"split={SPLIT}"], train, nano_command.with_settings)
     assert len(typed) == 1 and "There are no rows" in capsys.readouterr().err
@@ -425,3 +427,36 @@ def test_a_trained_row_without_memory_is_a_floor_under_any_name(rows: Path, tmp_
 def test_a_row_that_solves_every_scene_has_an_interval(board: Board) -> None:
     low, high = board.interval(row_of(board, "demonstrator"))
     assert low < 90 and high == pytest.approx(100)
+
+
+def test_memories_are_tested_over_trainings_where_they_have_enough(tmp_path: Path) -> None:
+    assert smallest_p([2, 2]) == pytest.approx(1 / 3) and smallest_p([3] * 4) == pytest.approx(1 / 15_400)
+    for number, row in enumerate("abcdef"):
+        for seed in range(2 if row < "f" else 1):
+            write_training(tmp_path, row, seed, {TASKS[0]: number // 2, TASKS[1]: (number + seed) % 4})
+    board = Board(read_rows([tmp_path]), samples=50)
+    first, second = board.separations[:2]
+    assert first.repeated == 5 and first.p_repeated == pytest.approx(4 * homogeneity(
+        [row.outcomes(TASKS[0]) for row in board.rows if len(row.method.trainings) > 1], over_trainings=True
+    ))  # fmt: skip
+    assert first.p_repeated < 0.05 < second.p_repeated
+    (sentence,) = board_page.separating(board)
+    assert sentence.endswith(f"Tested over trainings, the 5 with several differ in 1: {TASKS[0]}.")
+
+
+def test_a_users_row_of_a_known_name_has_its_budget(tmp_path: Path) -> None:
+    for folder in ("theirs", "mine"):
+        write_training(tmp_path / folder, "a@16", 0, 1, budget=16)
+    rows = Board(read_rows([tmp_path / "theirs"], local=[tmp_path / "mine"]), samples=50).rows
+    assert [row.budget for row in rows] == ["16", "16"]
+
+
+def test_a_row_whose_trainings_differ_more_than_others_has_a_wider_interval(tmp_path: Path) -> None:
+    half = dict.fromkeys(TASKS[:2], 3)
+    for seed in range(8):
+        write_training(tmp_path, "steady", seed, half)
+    for seed, won in enumerate((half, {TASKS[0]: 3})):
+        write_training(tmp_path, "restless", seed, won)
+    board = Board(read_rows([tmp_path]))
+    widths = {row.name: np.subtract(*board.interval(row)[::-1]) for row in board.rows}
+    assert widths["restless"] > 2 * widths["steady"]

@@ -75,7 +75,7 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     assert about["demonstrations"] == {"VideoUnmask": 2} and about["parameters"] > 1e6 and about["update_flops"] > 1e6
     runs.run(resolved(compose("nano", words)))
     assert len(made) == 2, "a finished run is not made again"
-    for changed, message in (("train.steps=3", "steps=2, and this command says 3"), ("learning.noise=0.5", "noise")):
+    for changed, message in (("train.steps=3", "steps was 2, and is 3"), ("learning.noise=0.5", "learning.noise was")):
         with pytest.raises(UserError, match=message):
             runs.run(resolved(compose("nano", [*words, changed])))
     killed = tmp_path / "run" / "training" / "framesamp_modul@2" / "0"
