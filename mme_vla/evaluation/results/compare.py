@@ -108,6 +108,7 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
         for task in tasks
     }
     means = 100 * np.mean([[side.mean() for side in sides] for sides in by_task.values()], axis=0)
+    means = means.round(9)  # equal counts, equal figures
     gaps = {task: first.mean(1) - second.mean(1) for task, (first, second) in by_task.items()}
     trained = any(len(method.trainings) > 1 for method in (first, second))
     sampled = {task: [sides[0], -sides[1]] if trained else [gaps[task][:, None]] for task, sides in by_task.items()}
