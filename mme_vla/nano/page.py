@@ -16,7 +16,6 @@ from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.nano.evaluating import PLANNER
 from mme_vla.nano.fitting import learning_curve
 from mme_vla.nano.rows import TRAINED
-from mme_vla.nano.runs import counts_of
 from mme_vla.utils import read_json, write_atomically
 from mme_vla.utils.pages import render
 
@@ -31,12 +30,14 @@ def write_page(
     minutes: Mapping[str, float],
     videos: Sequence[Path],
     runs: Mapping[str, Sequence[Path]],
+    demonstrations: int,
 ) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
     records: of each model, the one with memory first, and of the oracle planner. without: the one without memory, which
     all others are compared with. minutes: of each stage, on the clock. videos: one of a success, one of a failure,
-    as far as there are such. runs: of each model, the folders of its trainings.
+    as far as there are such. runs: of each model, the folders of its trainings. demonstrations: how many they learned
+    from.
     """
     ends = {model: [read_json(run / TRAINED, "a training's end") for run in folders] for model, folders in runs.items()}
     results, comparisons = compared(records, config["task"], config["split"], without)
@@ -48,7 +49,7 @@ def write_page(
     text = render(
         "nano.md",
         config=config,
-        demonstrations=sum(counts_of(config).values()),
+        demonstrations=demonstrations,
         seeds=str(config["policy_seed"]),
         planner=PLANNER,
         without=without,

@@ -73,7 +73,7 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     with minutes.of("films"):
         videos = videos_of(config, jobs, records, folder / "films")
     page = write_page(folder, config, records, rows.blind, minutes.spent, videos,
-                      {row: [job.folder for job in of_row] for row, of_row in jobs.items()})  # fmt: skip
+                      {row: [job.folder for job in of_row] for row, of_row in jobs.items()}, len(files))  # fmt: skip
     print(page)
     return page
 

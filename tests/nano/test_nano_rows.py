@@ -200,8 +200,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         write_json(tmp_path / model / TRAINED, {"off_by_m": [0.01, 0.02, 0.05]})
         (tmp_path / model / "metrics.jsonl").write_text('{"step": 10, "val/loss": 0.5}\n')
     config = {
-        "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4},
-        "demonstrations_of": {"VideoUnmask": {"hard": 3}}, "train": {"steps": 20},
+        "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4}, "train": {"steps": 20},
         "policy_seed": 7,
     }  # fmt: skip
     video = tmp_path / "films" / "a.mp4"
@@ -210,7 +209,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         "ttt_modul": records("ttt_modul", 20, 50, 4), "planner": records("planner", 100, 100),
     }  # fmt: skip
     folders = {model: [tmp_path / model] for model in runs if model != "planner"}
-    page = write_page(tmp_path, config, runs, "pi05", {"videos": 2.0}, [video], folders).read_text()
+    page = write_page(tmp_path, config, runs, "pi05", {"videos": 2.0}, [video], folders, 7).read_text()
     assert "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
     assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page
