@@ -43,10 +43,6 @@ class ExpertConfig:
     width: int
     mlp_dim: int
 
-    def check(self, section: str) -> None:
-        """Raise an error that names a key of its section, such as `backbone.vlm.`, if no expert has such sizes."""
-        check_positive(self, section)
-
 
 @dataclass(frozen=True)
 class BackboneConfig:
@@ -67,8 +63,8 @@ class BackboneConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
-        self.vlm.check("backbone.vlm.")
-        self.action.check("backbone.action.")
+        check_positive(self.vlm, "backbone.vlm.")
+        check_positive(self.action, "backbone.action.")
         check_multiple("backbone.", "num_heads", self.num_heads, "num_kv_heads", self.num_kv_heads)
         check_multiple("backbone.", "head_dim", self.head_dim, "pairs", 2)  # of a rotation
         check_multiple("backbone.", "action.width", self.action.width, "pairs", 2)  # sin and cos of the flow time

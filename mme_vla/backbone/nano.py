@@ -52,8 +52,8 @@ class NanoConfig:
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
-        self.vlm.check("backbone.vlm.")
-        self.action.check("backbone.action.")
+        check_positive(self.vlm, "backbone.vlm.")
+        check_positive(self.action, "backbone.action.")
         check_choice("backbone.goal", self.goal, ("text", "swap"))
         require(
             (self.goal == "swap") == (self.vision.layout == "segments"),

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig, check_positive
 from mme_vla.backbone.layers import Block, Visibility
 from mme_vla.errors import require
 from mme_vla.integration.base import (
@@ -87,7 +87,7 @@ class MemoryExpert(Integration):
         self.memory_position = checked_position(memory_position)
         self.visibility = memory_visibility(prompt_sees_memory)
         self._expert = ExpertConfig(self.memory_width, 2 * self.memory_width if mlp_dim is None else mlp_dim)
-        self._expert.check("integration.")
+        check_positive(self._expert, "integration.")
 
     def extra_experts(self) -> dict[str, ExpertConfig]:
         return {"memory": self._expert}
