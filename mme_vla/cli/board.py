@@ -47,18 +47,10 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
 
 
 def rows_of(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
-    """The folders of the rows of a run; others that its output holds may be unfinished."""
-    from mme_vla.nano.evaluating import DEMONSTRATOR, FREQUENT, ORACLE_FRAMES, PLANNER, RANDOM
+    """The folders of the rows that a run trains; others in its output may be unfinished."""
     from mme_vla.nano.runs import compose_rows
 
-    names = list(compose_rows(config, trees).composed)
-    names += [
-        row.replace(config["oracle"], ORACLE_FRAMES) for row in names if row.partition("@")[0] == config["oracle"]
-    ]
-    names += [DEMONSTRATOR, PLANNER] if config["planner"] else []
-    names += [RANDOM, FREQUENT] if config["floors"] else []
-    folders = [Path(config["output"]) / config["split"] / name for name in names]
-    return [folder for folder in folders if folder.is_dir()]
+    return [Path(config["output"]) / config["split"] / row for row in compose_rows(config, trees).composed]
 
 
 def alone(words: Sequence[str]) -> list[str]:
