@@ -18,7 +18,6 @@ from mme_vla.config.composition import compose, import_plugins, resolved
 from mme_vla.config.naming import digest
 from mme_vla.config.plugins import plugins_of
 from mme_vla.embodiment import Embodiment
-from mme_vla.embodiment.action_space import ActionSpace
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.nano.demonstrations import Demonstration
@@ -96,7 +95,8 @@ class Training:
     @property
     def full_config(self) -> dict[str, Any]:
         """All that the trained policy follows from, with digests of the demonstrations as `data.content`."""
-        content = content_of(self.files, Embodiment.from_dict(self.config["embodiment"]).action)
+        acts = Embodiment.from_dict(self.config["embodiment"]).action
+        content = list(content_of(tuple(self.files), tuple(acts.choice)))
         sections = {"train": dict(self.settings), "learning": dict(self.learning), "data": {"content": content}}
         return {**self.config, **sections}
 
@@ -181,11 +181,11 @@ def train(job: Training) -> Path:
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
     updates = train_settings.steps - run.step
-    whole = not run.step  # what an interrupted training took before is not known
+    resumed = run.step > 0  # what it took before is not known
     spent = {
         "update_s": (time.process_time() - updating) / updates if updates else None,
-        "minutes": (time.perf_counter() - begun) / 60 if whole else None,
-        "cpu_minutes": (time.process_time() - cpu) / 60 if whole else None,
+        "minutes": (time.perf_counter() - begun) / 60 if not resumed else None,
+        "cpu_minutes": (time.process_time() - cpu) / 60 if not resumed else None,
     }  # fmt: skip
     learned = MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval()
     (folder / CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(learned.config)), encoding="utf-8")
@@ -232,17 +232,13 @@ def held_out(policy: MMEPolicy, val_set: Decisions, folder: Path) -> dict[str, A
     return best | {"off_by_m": position_error(policy, val_set).tolist()}
 
 
-def content_of(files: Sequence[Path], acts: ActionSpace) -> list[str]:
+@lru_cache(maxsize=1)  # all trainings of a run have the same
+def content_of(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, ...]:
     """Digests of demonstrations: of their scenes, goals, numbers of decisions and letters, and `carried_out`.
 
     States and poses are left out: they differ in their last bits between processors. A demonstration that ends
-    otherwise on another processor has another digest.
+    otherwise on another processor has another digest. choice: columns of an action's letters, none of motions.
     """
-    return list(_content(tuple(files), tuple(acts.choice)))
-
-
-@lru_cache(maxsize=1)  # of the demonstrations of a run, which all its trainings share
-def _content(files: tuple[Path, ...], choice: tuple[int, ...]) -> tuple[str, ...]:
     digests = []
     for file in files:
         made = Demonstration.load(file, images=False)

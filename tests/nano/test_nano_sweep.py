@@ -105,9 +105,8 @@ def test_the_digest_of_demonstrations_is_of_their_scenes_and_choices(tmp_path: P
     }
     for name, variant in variants.items():
         variant.save(tmp_path / f"{name}.npz")
-    digests = dict(
-        zip(variants, fitting.content_of([tmp_path / f"{name}.npz" for name in variants], acts), strict=True)
-    )
+    files = tuple(tmp_path / f"{name}.npz" for name in variants)
+    digests = dict(zip(variants, fitting.content_of(files, tuple(acts.choice)), strict=True))
     same = {name for name, digest in digests.items() if digest == digests["a"]}
     assert same == {"a", "rendered elsewhere", "another processor"}
     assert Demonstration.load(tmp_path / "a.npz").length == 180
