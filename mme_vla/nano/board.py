@@ -170,27 +170,27 @@ class Board:
         """Bootstrap of the rows' success over tasks [rows, samples], in percent, on the same scenes for all.
 
         The mean of n trainings has normal noise of 1/√n of the deviation between trainings: of all rows, or the row's
-        own where that is larger, without the luck of episodes, which the scenes bring.
+        own where that is larger, without the variance of single episodes, which the sampled scenes have already.
         """
         values = {task: [row.outcomes(task).mean(1, keepdims=True) for row in rows] for task in tasks}
         means = 100 * resampled_means(values, self.protocol.samples, self.protocol.seed)
-        rng, shared = np.random.default_rng([self.protocol.seed, 2]), self._beyond_luck(self.rows, tasks)
+        rng, shared = np.random.default_rng([self.protocol.seed, 2]), self._training_deviation(self.rows, tasks)
         for row, sampled in zip(rows, means, strict=True):
             if row.facts.trained:
-                deviation = max(shared, self._beyond_luck([row], tasks))
+                deviation = max(shared, self._training_deviation([row], tasks))
                 sampled += rng.normal(0, deviation / len(row.method.trainings) ** 0.5, len(sampled))
         return means.clip(0, 100).round(9)
 
-    def _beyond_luck(self, rows: Sequence[Row], tasks: Sequence[str]) -> float:
-        """Deviation of success between trainings of a row, less that of episodes which end otherwise on their own."""
+    def _training_deviation(self, rows: Sequence[Row], tasks: Sequence[str]) -> float:
+        """Deviation of success between trainings of one row, without the variance of single episodes."""
         repeated = [row for row in rows if len(row.method.trainings) > 1]
         if not repeated:
             return 0.0
         noise = pooled([row.mean(tasks) for row in repeated]) or 0.0
-        spread = [sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks) for row in repeated]
+        variances = [sum(row.outcomes(task).var(1, ddof=1).sum() for task in tasks) for row in repeated]
         degrees = [len(row.method.trainings) - 1 for row in repeated]
-        luck = np.average(spread, weights=degrees) * (100 / len(tasks) / self.protocol.episodes) ** 2
-        return float(max(0.0, noise**2 - luck) ** 0.5)
+        of_episodes = np.average(variances, weights=degrees) * (100 / len(tasks) / self.protocol.episodes) ** 2
+        return float(max(0.0, noise**2 - of_episodes) ** 0.5)
 
     @cached_property
     def sampled(self) -> dict[str, np.ndarray]:
@@ -199,9 +199,9 @@ class Board:
 
     def interval(self, row: Row) -> Interval:
         """Of a row's success over all tasks, in percent; Wilson's where no draw differs."""
-        drawn = percentiles(self.sampled[row.name])
-        if drawn.low < drawn.high:
-            return drawn
+        interval = percentiles(self.sampled[row.name])
+        if interval.low < interval.high:
+            return interval
         scenes = len(self.protocol.tasks) * self.protocol.episodes
         return Interval(*(100 * end for end in wilson(self.success(row) / 100, scenes)))
 

@@ -126,19 +126,20 @@ class Scene:
     def _complete(self) -> bool:
         with np.load(self.path) as file:
             about = parse_json(str(file["about"]), str(self.path))
-            was, width = about.get("carried_out", False), file["targets"].shape[1]
+            carried_out, width = about.get("carried_out", False), file["targets"].shape[1]
             required = width if self.acts is None else self.acts.width
             require(
-                (was, width) == (self.carried_out, required),
-                f"{self.path} holds actions of {width} numbers with carried_out={was}, and this command records "
-                f"{required} with carried_out={self.carried_out}: choose another output.",
+                (carried_out, width) == (self.carried_out, required),
+                f"{self.path} holds actions of {width} numbers with carried_out={carried_out}, and this command "
+                f"records {required} with carried_out={self.carried_out}: choose another output.",
             )
-            decided = [file["decisions"][:: choice.every] for choice in self.choices]
-            read = [choice.read(at, about["exec_start"]) for choice, at in zip(self.choices, decided, strict=True)]
-            seen = {camera: set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist()) for camera in CAMERAS}
-            everywhere = {frame for at in decided for frame in at.tolist()}
-            remembered = set[int]().union(*read) if "front" in self.cameras else set()
-            return remembered <= seen["front"] and all(everywhere <= seen[camera] for camera in self.cameras)
+            decisions = [file["decisions"][:: choice.every] for choice in self.choices]
+            read = [choice.read(at, about["exec_start"]) for choice, at in zip(self.choices, decisions, strict=True)]
+            for camera in self.cameras:
+                rendered = set(file.get(f"{camera}_frames", np.zeros(0, np.int64)).tolist())
+                if not set().union(*(read if camera == "front" else decisions)) <= rendered:
+                    return False
+            return True
 
 
 def demonstrated(scene: Scene) -> bool:

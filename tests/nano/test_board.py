@@ -88,7 +88,7 @@ def test_intervals_have_the_noise_of_a_rows_number_of_trainings(
     for row, seed in (("one", 0), ("four", 0), ("four", 1), ("four", 2), ("four", 3)):
         write_training(tmp_path, row, seed, half)
     write_training(tmp_path, "random", 0, half, "floor", trained=False, parameters=None, update_s=None)
-    monkeypatch.setattr(Board, "_beyond_luck", lambda *_: 4.0)
+    monkeypatch.setattr(Board, "_training_deviation", lambda *_: 4.0)
     board = Board(read_rows([tmp_path]))
     deviations = {name: draws.std() for name, draws in board.sampled.items()}
     assert deviations == pytest.approx({"one": 4, "four": 2, "random": 0}, rel=0.1)
