@@ -54,10 +54,9 @@ def add(folder: Path) -> None:
 
 
 def add_scenes(file: Path, target: Path) -> None:
-    """Add what a run found of the scenes that can be built to what its table knows of them."""
-    known = read_json(target, "the scenes of a split")["tried"] if target.is_file() else {}
-    found = read_json(file, "the scenes of a split")
-    write_json(target, {**found, "tried": dict(sorted((found["tried"] | known).items()))})
+    """Add the scenes that a run tried to those of its table."""
+    scenes, listed = (read_json(path, "the scenes of a split") if path.is_file() else {} for path in (file, target))
+    write_json(target, {**scenes, "tried": dict(sorted((scenes["tried"] | listed.get("tried", {})).items()))})
 
 
 def copy_receipt(receipt: Path, target: Path) -> None:
