@@ -5,14 +5,15 @@ Words of `mme-vla nano` train and evaluate a row first, as far as it is not ther
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.composition import compose, resolved
-from mme_vla.errors import printable
+from mme_vla.errors import listed, printable, require
 
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
@@ -40,17 +41,43 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
         config = compose("nano", with_settings(words), extra_dirs=trees)
         trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
+            trained = planned(resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees)
             sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
             nano()
-            trained = rows_of(resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees)
         run(args, str(config.split), trained)
 
 
-def rows_of(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
-    """The folders of the rows that a run trains; others in its output may be unfinished."""
-    from mme_vla.nano.runs import compose_rows
+def planned(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
+    """The folders of the rows that a run is going to train; others in its output may be unfinished.
 
-    return [Path(config["output"]) / config["split"] / row for row in compose_rows(config, trees).composed]
+    Raises:
+        UserError: rows of these settings would not fit those of the repository.
+    """
+    from mme_vla.envs.episodes import choose_episodes
+    from mme_vla.nano.rows import TRAINED, read_training, rules_text, table_of
+    from mme_vla.nano.runs import compose_rows, rules_of
+
+    rows, rules, split = compose_rows(config, trees), rules_of(config), config["split"]
+    actions = rows.robot.action.answers or rows.robot.name
+    shipped = SHIPPED / table_of(split, actions)
+    if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
+        other = read_training(folder)
+        compared = {
+            "episodes": (_counted(choose_episodes(config["task"], config["episodes"], split)), _counted(other.records)),
+            "max_steps": (rules.steps, other.records[0].max_steps),
+            "rules": (rules_text(actions, rules.max_choices, rules.only_possible), other.rules),
+        }
+        for name, (own, shared) in compared.items():
+            require(
+                own == shared, f"A row with {name} {own} cannot stand beside those of {shipped}: they have {shared}."
+            )
+    return [Path(config["output"]) / split / row for row in rows.composed]
+
+
+def _counted(scenes: Iterable[Any]) -> str:
+    """How many scenes there are of each task."""
+    counts = Counter(scene.task for scene in scenes)
+    return listed((f"{task} {count}" for task, count in sorted(counts.items())), len(counts))
 
 
 def alone(words: Sequence[str]) -> list[str]:

@@ -74,14 +74,16 @@ class RMTLayer(RecurrentLayer):
         with full_precision(x):
             (slots,), patches, changes = state, x.shape[2], []
             # Recomputed, not stored: frame tokens come first, and any number of slots after them.
-            rope = angles(patches + slots.shape[1], self.head_dim, x.device)
-            of_frame, of_slots = rope[:patches], rope[patches:]
-            frame_k, frame_v = self._keys_values(layer_norm(self.pre_norm, x.float()), of_frame)  # b t p kv h
+            rope = angles(patches + slots.shape[1], self.head_dim, x.device)[:, None]  # n 1 h/2
+            cos, sin = rope.cos(), rope.sin()
+            of_frame, of_slots = (cos[:patches], sin[:patches]), (cos[patches:], sin[patches:])
+            kv = self.kv.weight.float()
+            qkv = torch.cat([self.q.weight.float(), kv])  # projected and rotated together: fewer small operations
+            frame_k, frame_v = self._heads(layer_norm(self.pre_norm, x.float()), kv, of_frame)  # b t p kv h
             for t in range(x.shape[1]):
-                normed = layer_norm(self.pre_norm, slots.float())
-                k, v = self._keys_values(normed, of_slots)
+                turned, v = self._heads(layer_norm(self.pre_norm, slots.float()), qkv, of_slots)
+                q, k = turned.tensor_split([-self.kv_heads], -2)
                 k, v = torch.cat([frame_k[:, t], k], 1), torch.cat([frame_v[:, t], v], 1)
-                q = self._rotate(linear(self.q, normed).unflatten(-1, (-1, self.head_dim)), of_slots)
                 output = linear(self.out, self._attend(q, k, v)) + slots.float()
                 updated = layer_norm(self.post_norm, output).to(slots.dtype)
                 new = torch.where(valid[:, t, None, None], updated, slots)
@@ -94,13 +96,14 @@ class RMTLayer(RecurrentLayer):
         (slots,) = state
         return slots, torch.ones(slots.shape[:2], dtype=torch.bool, device=slots.device)
 
-    def _keys_values(self, x: Tensor, rope: Tensor) -> tuple[Tensor, Tensor]:
-        k, v = linear(self.kv, x).unflatten(-1, (2 * self.kv_heads, self.head_dim)).chunk(2, -2)
-        return self._rotate(k, rope), v
+    def _heads(self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values, which are last."""
+        heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
+        turned, v = heads.tensor_split([-self.kv_heads], -2)
+        return self._rotate(turned, *rope), v
 
-    def _rotate(self, x: Tensor, rope: Tensor) -> Tensor:
-        """Turn the pairs (2i, 2i + 1) of [..., n, heads, h] by angles [n, h/2]."""
-        cos, sin = rope.cos()[:, None], rope.sin()[:, None]
+    def _rotate(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+        """Turn the pairs (2i, 2i + 1) of [..., n, heads, h] by angles of cosine and sine [n, 1, h/2]."""
         a, b = x[..., 0::2], x[..., 1::2]
         if self.rotation == "cosine_only":
             return torch.stack([a * cos, b * cos], -1).flatten(-2)
@@ -125,8 +128,10 @@ def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tenso
     Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over a window.
     """
     q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
-    weights = ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1)
-    return (weights.to(dtype) @ v).float()
+    weights = ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1).to(dtype)
+    if q.device.type == "cpu":  # sums are float32 either way, and many CPUs only emulate products of bfloat16
+        return (weights.float() @ v.float()).to(dtype).float()
+    return (weights @ v).float()
 
 
 @torch.no_grad()

@@ -82,13 +82,22 @@ class Training:
     @property
     def table(self) -> str:
         """Name of the table that it belongs to, and of that table's folder: its split, and any other action space."""
-        split = self.records[0].split
-        return split if self.action_space == CHOICES else f"{split}-{self.action_space}"
+        return table_of(self.records[0].split, self.action_space)
 
     @property
     def scenes(self) -> dict[EpisodeKey, tuple[str, int, str, int]]:
         """Split, seed, difficulty and step limit of each episode."""
         return {r.key: (r.split, r.seed, r.difficulty, r.max_steps) for r in self.records}
+
+
+def table_of(split: str, action_space: str) -> str:
+    """Name of the table of a split: rows of other actions than choices have their own."""
+    return split if action_space == CHOICES else f"{split}-{action_space}"
+
+
+def rules_text(action_space: str, max_choices: int | None, only_possible: bool) -> str:
+    """What rows of one board have the same, beside their scenes."""
+    return f"action_space={action_space}, max_choices={max_choices}, only_possible={only_possible}"
 
 
 def read_rows(folders: Iterable[Path], local: Iterable[Path] = ()) -> dict[str, list[Training]]:
@@ -161,7 +170,7 @@ def read_training(folder: Path) -> Training:
     require(not twice, f"{folder} has episodes twice: {listed(twice)}. Keep one record of each.")
     settings = run["settings"]
     n_choices, possible = settings.get("max_actions", settings.get("max_choices")), settings.get("only_possible", False)
-    rules = f"action_space={records[0].action_space}, max_choices={n_choices}, only_possible={possible}"
+    rules = rules_text(records[0].action_space, n_choices, possible)
     return Training(folder, facts, _numbered(folder, records), rules)
 
 

@@ -398,6 +398,37 @@ def test_a_model_is_trained_before_the_board_is_made(
     assert len(typed) == 1 and "There are no rows" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("episodes=2", "episodes BinFill 2, .* they have BinFill 3,"),
+        ("max_steps=9", "max_steps 9 .* 500"),
+        ("max_choices=7", "max_choices=7, .* max_choices=None"),
+        ("task=BinFill", "episodes BinFill 3 cannot"),
+    ],
+)
+def test_a_row_that_the_board_could_not_have_is_refused_before_it_is_trained(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, word: str, message: str
+) -> None:
+    write_training(tmp_path / SPLIT, "framesamp_modul", 0, 2)
+    monkeypatch.setattr(board_command, "SHIPPED", tmp_path)
+    words = ["nano=null", f"task=[{','.join(TASKS)}]", "model=framesamp_modul", f"split={SPLIT}", "episodes=3",
+             "max_steps=500", "backbone=nano_choice", "embodiment=robomme_choice_front", "drawn_for=[]",
+             f"output={tmp_path / 'out'}"]  # fmt: skip
+    trained: list[Path] = []
+
+    def train() -> None:
+        trained.append(write_training(tmp_path / "out" / SPLIT, "framesamp_modul", 1, 3))
+
+    key = word.partition("=")[0]
+    with pytest.raises(SystemExit):
+        wrong = [word if each.partition("=")[0] == key else each for each in words]
+        board_command.main(wrong if word in wrong else [*words, word], train, nano_command.with_settings)
+    assert re.search(message, " ".join(capsys.readouterr().err.split())) and not trained
+    board_command.main([*words, "--samples", "50"], train, nano_command.with_settings)
+    assert len(trained) == 1 and "framesamp_modul (yours): place 1" in capsys.readouterr().out
+
+
 def test_two_trainings_of_one_seed_are_refused_wherever_they_stand(tmp_path: Path) -> None:
     for folder, seed in (("a", 0), ("a", 1), ("b", 1)):
         write_training(tmp_path / folder, "mine", seed, 1)
