@@ -49,16 +49,19 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
     if not (console.is_terminal and console.file.isatty()):  # FORCE_COLOR makes the first true, in notebooks too
         begun = reported = time.monotonic()
         count = done
+        first: tuple[float, int] | None = None  # with it start-up is over, and what was there before is counted
 
         def count_up(steps: int) -> None:
-            nonlocal reported, count
+            nonlocal reported, count, first
             count += steps
             now = time.monotonic()
+            first = first or (now, count)
             if count < total and now - reported < LINE_SECONDS:
                 return
             reported = now
-            each = (now - begun) / max(count - done, 1)
-            remaining = f", about {_duration_text(each * (total - count))} left" if count < total else ""
+            remaining, timed = "", count - first[1]
+            if timed and count < total:
+                remaining = f", about {_duration_text((now - first[0]) / timed * (total - count))} left"
             so_far = f"{count:,} of {total:,} {unit}".rstrip()
             console.print(f"{description}: {so_far} in {_duration_text(now - begun)}{remaining}")
 

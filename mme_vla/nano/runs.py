@@ -70,8 +70,8 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
         for row, of_row in records.items():
             logger.info("%s: %d of %d episodes", row, sum(record.success for record in of_row), len(of_row))
         return results
-    with minutes.of("films"):
-        videos = videos_of(config, jobs, records, folder / "films")
+    with minutes.of("videos"):
+        videos = videos_of(config, jobs, records, folder / "videos")
     page = write_page(folder, config, records, rows.blind, minutes.spent, videos,
                       {row: [job.folder for job in of_row] for row, of_row in jobs.items()}, len(files))  # fmt: skip
     print(page)
@@ -110,7 +110,7 @@ def compose_rows(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> 
         for budget in [None] if model == MATCHED else as_list(config["budget"]):
             each = compose_policy(model, *how, budget=budget)
             composed[model if budget is None or each["memory"] is None else f"{model}@{budget}"] = each
-    others = [compose_policy(model, *how) for model in config["drawn_for"] if model not in models]
+    others = [compose_policy(model, *how) for model in config["rendered_for"] if model not in models]
     robot = Embodiment.from_dict(next(iter(composed.values()))["embodiment"])
     for vision in (each["backbone"].get("vision") for each in composed.values()):
         layout = vision.get("layout") if isinstance(vision, Mapping) else None
@@ -217,7 +217,7 @@ def videos_of(
     """Videos of a success and a failure of the first row's first training."""
     from mme_vla.nano.evaluating import record_videos
 
-    if not config["films"]:
+    if not config["videos"]:
         return []
     row, of_row = next(iter(jobs.items()))
     first = records[row][: len(records[row]) // len(of_row)]

@@ -46,7 +46,7 @@ PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
 STEP = "run/checkpoints/step_000001"
 NANO = (
     "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0 demonstrations.hard=0 "
-    "train.steps=20 train.batch_size=4 train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] drawn_for=[] "
+    "train.steps=20 train.batch_size=4 train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] rendered_for=[] "
     "output=nano"
 )
 """The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes."""
@@ -216,7 +216,7 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
         assert {record.action_space for record in records} == {"waypoint"}
         page = (nano / "page.md").read_text()
         assert "| framesamp_modul" in page and "| planner" in page and (nano / "learning.png").is_file()
-        videos = list(nano.glob("films/failure/**/*.mp4"))
+        videos = list(nano.glob("videos/failure/**/*.mp4"))
         assert len(videos) == 1 and videos[0].name in page
         saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
         assert run(case, folder)[0] == 0

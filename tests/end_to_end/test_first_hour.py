@@ -25,7 +25,7 @@ SETTINGS = {
     "02_closed_loop.ipynb": {"EPISODES": "[0]", "MAX_STEPS": "3"},
     "03_own_memory.ipynb": {
         "DEMONSTRATIONS": "2", "UPDATES": "1", "EPISODES": "1",
-        "MORE": '"films=false train.batch_size=2 train.val_samples=2"',
+        "MORE": '"videos=false train.batch_size=2 train.val_samples=2"',
     },
     "04_probe.ipynb": {"POLICY": '"nano"', "EPISODES": '"[4]"', "ARMS": '["drop:all"]', "DRAWS, DECISIONS": "2, 1"},
 }  # fmt: skip

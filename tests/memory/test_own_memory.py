@@ -66,7 +66,7 @@ def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
     except UserError as error:
         pytest.skip(str(error))
     settings = [
-        "beside=[]", "also=[]", "drawn_for=[]", "planner=false", "films=false", "split=val", "episodes=1",
+        "beside=[]", "also=[]", "rendered_for=[]", "planner=false", "videos=false", "split=val", "episodes=1",
         "max_steps=1", "demonstrations={easy: 2, medium: 0, hard: 0}", "train.steps=1", "train.batch_size=2",
         "+memories.last_frames={budget: 4, grid: 1, spacing: 32}",
     ]  # fmt: skip

@@ -413,7 +413,7 @@ def test_a_row_that_the_board_could_not_have_is_refused_before_it_is_trained(
     write_training(tmp_path / SPLIT, "framesamp_modul", 0, 2)
     monkeypatch.setattr(board_command, "SHIPPED", tmp_path)
     words = ["nano=null", f"task=[{','.join(TASKS)}]", "model=framesamp_modul", f"split={SPLIT}", "episodes=3",
-             "max_steps=500", "backbone=nano_choice", "embodiment=robomme_choice_front", "drawn_for=[]",
+             "max_steps=500", "backbone=nano_choice", "embodiment=robomme_choice_front", "rendered_for=[]",
              f"output={tmp_path / 'out'}"]  # fmt: skip
     trained: list[Path] = []
 

@@ -88,7 +88,7 @@ def test_backbone_and_embodiment_are_chosen_on_the_command_line() -> None:
 
 
 def test_mirrored_places_of_motions_are_refused_before_anything_is_recorded() -> None:
-    one = ["with_memory=framesamp_modul", "beside=[]", "also=[]", "drawn_for=[]"]
+    one = ["with_memory=framesamp_modul", "beside=[]", "also=[]", "rendered_for=[]"]
     with pytest.raises(UserError, match=r"learning\.reflect=0\.5 needs a point"):
         compose_rows(resolved(compose("nano", ["nano=motions", "learning.reflect=0.5", *one])))
     with pytest.raises(UserError, match=r"backbone=nano_choice"):
@@ -181,7 +181,7 @@ def test_floors_and_ceilings_are_played_and_resumed(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_command_learns_two_tasks_and_continues_in_a_fresh_process(tmp_path: Path, renderer: str) -> None:
     words = [
-        "nano=nano16", "task=[StopCube,MoveCube]", "model=framesamp_modul", "beside=[pi05]", "drawn_for=[]",
+        "nano=nano16", "task=[StopCube,MoveCube]", "model=framesamp_modul", "beside=[pi05]", "rendered_for=[]",
         "demonstrations={easy: 2, medium: 0, hard: 0}", "trainings=1", "train.batch_size=2", "train.steps=3",
         "split=val", "episodes=1", "max_choices=2", "workers=2", f"output={tmp_path}",
     ]  # fmt: skip

@@ -203,7 +203,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         "task": "VideoUnmask", "split": "further", "demonstrations": {"easy": 4}, "train": {"steps": 20},
         "policy_seed": 7,
     }  # fmt: skip
-    video = tmp_path / "films" / "a.mp4"
+    video = tmp_path / "videos" / "a.mp4"
     runs = {
         "framesamp_modul": records("framesamp_modul", 60, 100, 4), "pi05": records("pi05", 5, 100),
         "ttt_modul": records("ttt_modul", 20, 50, 4), "planner": records("planner", 100, 100),
@@ -212,7 +212,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     page = write_page(tmp_path, config, runs, "pi05", {"videos": 2.0}, [video], folders, 7).read_text()
     assert "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
-    assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page
+    assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "videos/a.mp4" in page
     assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
     assert page.count("Incomplete") == 1 and "7 demonstrations" in page
     assert "| videos | 2.0 |" in page and (tmp_path / "learning.png").is_file()
