@@ -81,8 +81,8 @@ class RMTLayer(RecurrentLayer):
             qkv = torch.cat([self.q.weight.float(), kv])  # projected and rotated together: fewer small operations
             frame_k, frame_v = self._heads(layer_norm(self.pre_norm, x.float()), kv, of_frame)  # b t p kv h
             for t in range(x.shape[1]):
-                turned, v = self._heads(layer_norm(self.pre_norm, slots.float()), qkv, of_slots)
-                q, k = turned.tensor_split([-self.kv_heads], -2)
+                qk, v = self._heads(layer_norm(self.pre_norm, slots.float()), qkv, of_slots)
+                q, k = qk.tensor_split([-self.kv_heads], -2)
                 k, v = torch.cat([frame_k[:, t], k], 1), torch.cat([frame_v[:, t], v], 1)
                 output = linear(self.out, self._attend(q, k, v)) + slots.float()
                 updated = layer_norm(self.post_norm, output).to(slots.dtype)
@@ -99,11 +99,11 @@ class RMTLayer(RecurrentLayer):
     def _heads(self, x: Tensor, weight: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """Project x [..., n, hidden] to heads [..., n, heads, h], and rotate all but the values, which are last."""
         heads = nn.functional.linear(x, weight).unflatten(-1, (-1, self.head_dim))
-        turned, v = heads.tensor_split([-self.kv_heads], -2)
-        return self._rotate(turned, *rope), v
+        qk, v = heads.tensor_split([-self.kv_heads], -2)
+        return self._rotate(qk, *rope), v
 
     def _rotate(self, x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
-        """Turn the pairs (2i, 2i + 1) of [..., n, heads, h] by angles of cosine and sine [n, 1, h/2]."""
+        """Rotate the pairs (2i, 2i + 1) of [..., n, heads, h] by angles with cosines and sines [n, 1, h/2]."""
         a, b = x[..., 0::2], x[..., 1::2]
         if self.rotation == "cosine_only":
             return torch.stack([a * cos, b * cos], -1).flatten(-2)
