@@ -6,14 +6,14 @@ Words of `mme-vla nano` train and evaluate a row first, as far as it is not ther
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.composition import compose, resolved
-from mme_vla.errors import listed, printable, require
+from mme_vla.errors import printable, require
 
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
@@ -41,14 +41,14 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
         config = compose("nano", with_settings(words), extra_dirs=trees)
         trained: list[Path] = []
         if any(word.startswith("model=") for word in words):
-            trained = planned(resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees)
+            trained = row_folders(resolved(compose("nano", with_settings(alone(words)), extra_dirs=trees)), trees)
             sys.argv[1:] = alone(words) + [word for tree in trees for word in ("--config-dir", str(tree))]
             nano()
         run(args, str(config.split), trained)
 
 
-def planned(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
-    """The folders of the rows that a run is going to train; others in its output may be unfinished.
+def row_folders(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
+    """The folders of the rows that a run trains; others in its output may be unfinished.
 
     Raises:
         UserError: rows of these settings would not fit those of the repository.
@@ -62,22 +62,17 @@ def planned(config: Mapping[str, Any], trees: Sequence[Path]) -> list[Path]:
     shipped = SHIPPED / table_of(split, actions)
     if folder := next((file.parent for file in sorted(shipped.rglob(TRAINED))), None):
         other = read_training(folder)
+        specs = choose_episodes(config["task"], config["episodes"], split)
         compared = {
-            "episodes": (_counted(choose_episodes(config["task"], config["episodes"], split)), _counted(other.records)),
+            "episodes": tuple(dict(Counter(scene.task for scene in scenes)) for scenes in (specs, other.records)),
             "max_steps": (rules.steps, other.records[0].max_steps),
             "rules": (rules_text(actions, rules.max_choices, rules.only_possible), other.rules),
         }
-        for name, (own, shared) in compared.items():
+        for name, (value, expected) in compared.items():
             require(
-                own == shared, f"A row with {name} {own} cannot stand beside those of {shipped}: they have {shared}."
+                value == expected, f"A row with {name} {value} does not fit those of {shipped}: they have {expected}."
             )
     return [Path(config["output"]) / split / row for row in rows.composed]
-
-
-def _counted(scenes: Iterable[Any]) -> str:
-    """How many scenes there are of each task."""
-    counts = Counter(scene.task for scene in scenes)
-    return listed((f"{task} {count}" for task, count in sorted(counts.items())), len(counts))
 
 
 def alone(words: Sequence[str]) -> list[str]:

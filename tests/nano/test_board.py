@@ -401,13 +401,13 @@ def test_a_model_is_trained_before_the_board_is_made(
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("episodes=2", "episodes BinFill 2, .* they have BinFill 3,"),
+        ("episodes=2", "episodes {'BinFill': 2, .* they have {'BinFill': 3,"),
         ("max_steps=9", "max_steps 9 .* 500"),
         ("max_choices=7", "max_choices=7, .* max_choices=None"),
-        ("task=BinFill", "episodes BinFill 3 cannot"),
+        ("task=BinFill", "episodes {'BinFill': 3} does not fit"),
     ],
 )
-def test_a_row_that_the_board_could_not_have_is_refused_before_it_is_trained(
+def test_a_row_that_does_not_fit_the_board_is_refused_before_it_is_trained(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, word: str, message: str
 ) -> None:
     write_training(tmp_path / SPLIT, "framesamp_modul", 0, 2)
