@@ -49,7 +49,7 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
     if not (console.is_terminal and console.file.isatty()):  # FORCE_COLOR makes the first true, in notebooks too
         begun = reported = time.monotonic()
         count = done
-        first: tuple[float, int] | None = None  # with it start-up is over, and what was there before is counted
+        first: tuple[float, int] | None = None  # time and count after start-up, with what was there before
 
         def count_up(steps: int) -> None:
             nonlocal reported, count, first
@@ -59,9 +59,9 @@ def progress(description: str, total: int, done: int = 0, unit: str = "") -> Ite
             if count < total and now - reported < LINE_SECONDS:
                 return
             reported = now
-            remaining, timed = "", count - first[1]
-            if timed and count < total:
-                remaining = f", about {_duration_text((now - first[0]) / timed * (total - count))} left"
+            remaining, n_new = "", count - first[1]
+            if n_new and count < total:
+                remaining = f", about {_duration_text((now - first[0]) / n_new * (total - count))} left"
             so_far = f"{count:,} of {total:,} {unit}".rstrip()
             console.print(f"{description}: {so_far} in {_duration_text(now - begun)}{remaining}")
 

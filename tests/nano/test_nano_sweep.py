@@ -61,13 +61,8 @@ def test_a_sweep_shares_demonstrations_and_tokens_and_has_one_table(
     monkeypatch.setattr(evaluating, "run_episodes", episodes)
     words = with_settings(["task=VideoUnmask", "nano=null", "model=framesamp_modul", "budget=2,4"])
     words += ["trainings=2", "beside=[]", "rendered_for=[]", "planner=false", "videos=false"]
-    words += [
-        f"output={tmp_path / 'run'}",
-        "train.steps=2",
-        "train.val_samples=4",
-        "train.batch_size=2",
-        "train.log_every=1",
-    ]
+    words += ["train.steps=2", "train.val_samples=4", "train.batch_size=2", "train.log_every=1"]
+    words += [f"output={tmp_path / 'run'}"]
     page = runs.run(resolved(compose("nano", words))).read_text()
     assert len(recorded) == 1 and len(made) == 2, "each frame is encoded once"
     assert all(f"| framesamp_modul-every_8-grid_1 | {budget} | 50 ± 0 % (2/4) |" in page for budget in (2, 4))
