@@ -51,6 +51,22 @@ def tasks(board: Board) -> Table:
     return Table("Success by task (%)", ["row", *names], rows)
 
 
+def trainings(board: Board) -> Table:
+    """Scenes that each training solves, of rows with several: in all, by suite and by task."""
+    suites = [tuple(board.protocol.choose("suite", suite)) for suite in board.protocol.suites]
+    scopes = [board.protocol.tasks, *suites, *((task,) for task in board.protocol.tasks)]
+    rows: list[list[str]] = []
+    for row in board.rows:
+        several = row.method.trainings if len(row.method.trainings) > 1 else []
+        solved = [sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes]  # each [trainings]
+        for number, runs in enumerate(several):
+            identity = runs[0].key.training
+            seed = "–" if identity is None else str(identity.seed)
+            rows.append([row.name, seed, *(f"{of_scope[number]:g}" for of_scope in solved)])
+    columns = ["row", "training seed", "all", *board.protocol.suites, *board.protocol.tasks]
+    return Table("Scenes solved by each training", columns, rows)
+
+
 def separations(board: Board) -> Table:
     """Tasks and budgets at which memories differ, the clearest first."""
     rows = []
@@ -221,18 +237,19 @@ def published_figure(board: Board) -> str:
 
 def all_tables(board: Board) -> list[Table]:
     """Every table of the board."""
-    return [ranking(board), targets(board), comparison_table(board.neighbours()), tasks(board), separations(board),
-            published(board), agreements(board)]  # fmt: skip
+    return [ranking(board), targets(board), comparison_table(board.neighbours()), tasks(board), trainings(board),
+            separations(board), published(board), agreements(board)]  # fmt: skip
 
 
 def page(board: Board) -> str:
     """The board as one page of HTML, which loads nothing."""
-    ranks, aims, pairs, by_task, differ, beside, agree = all_tables(board)
+    ranks, aims, pairs, by_task, by_training, differ, beside, agree = all_tables(board)
     sections = [
         Section("Ranking", success_figure(board), [ranks], paragraphs=notes(board)),
         *([Section("Targets", tables=[aims])] if aims.rows else []),
         Section("Neighbours", tables=[pairs], caption="P values are corrected by Holm for the number of pairs."),
         Section("Tasks", tables=[by_task]),
+        *([Section("Trainings", tables=[by_training])] if by_training.rows else []),
         Section("Do memories differ?", budget_figure(board), [differ], paragraphs=separating(board)),
     ]
     if board.published:

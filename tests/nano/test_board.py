@@ -206,6 +206,21 @@ def test_the_published_ranking_stands_beside(board: Board) -> None:
     assert cells[1] == "83.3 (1)" and cells[2].endswith("(1)")
 
 
+def test_trainings_are_listed_with_the_scenes_each_solves(rows: Path, tmp_path: Path) -> None:
+    """A row of one training has its scenes in the other tables."""
+    for seed, solved in {3: {"BinFill": 3, "VideoUnmask": 1}, 11: 2}.items():
+        write_training(tmp_path, "mine", seed, solved)
+    board = Board(read_rows([rows, tmp_path]), samples=50)
+    table = board_page.trainings(board)
+    assert table.columns == ["row", "training seed", "all", *board.protocol.suites, *TASKS]
+    assert [cells[1:] for cells in table.rows if cells[0] == "mine"] == [
+        ["3", "4", "3", "1", "0", "0", "3", "1", "0", "0"],
+        ["11", "8", *"2222", *"2222"],
+    ]
+    assert [cells[0] for cells in table.rows].count("framesamp_modul") == 2
+    assert not {"present_modul", "random", "demonstrator"} & {cells[0] for cells in table.rows}
+
+
 def test_the_page_holds_the_numbers(board: Board) -> None:
     html = board_page.page(board)
     for text in ("framesamp_modul", "83.33 ± 23.57", "1,419,194", "12.00", "0.130", "Targets"):
