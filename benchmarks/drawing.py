@@ -1,4 +1,4 @@
-"""What images on demand save: evaluation episodes and demonstrations, drawn where looked at, against drawn whole.
+"""What images on demand save: evaluation episodes and demonstrations, rendered where read, against rendered in full.
 
     python benchmarks/drawing.py [MODEL ...] [--task VideoUnmask] [--steps 128] [--no-record] [--no-episodes]
 
@@ -91,7 +91,7 @@ class Measured:
 
     cpu_s: float
     env_s: float
-    """CPU seconds of the environment alone: building it, simulating and drawing."""
+    """CPU seconds of the environment alone: building it, simulation and rendering."""
     wall_s: float
     images: dict[str, int]
     record: EpisodeRecord

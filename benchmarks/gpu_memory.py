@@ -7,7 +7,7 @@
 
 One process a figure, one line of JSON. Weights hold whatever was in memory: nothing is learned, only counted. It asks
 for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as docs/evidence has it; `shared` is one of
-so many processes of one machine, and speaks to nobody.
+so many processes of one machine, and communicates with none.
 """
 
 import argparse
@@ -86,7 +86,7 @@ def shared(
     apply_finetuning(policy, mode, frozen_dtype=frozen_dtype)
     policy.train().recompute(recompute == "all" or recompute or False)  # type: ignore[arg-type]
     mesh = parallel.ParallelSettings("fsdp").mesh("cuda")
-    # Nobody has weights to send: what comes after the sharding is left out.
+    # No process has weights to send: what comes after the sharding is left out.
     original, parallel.set_model_state_dict = parallel.set_model_state_dict, lambda *_, **__: None
     rank, distributed.get_rank = distributed.get_rank, lambda *_: 1
     try:

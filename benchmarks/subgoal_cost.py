@@ -1,4 +1,4 @@
-"""What a subgoal predictor costs in an episode, beside the policy it speaks to: calls, tokens and FLOPs.
+"""What a subgoal predictor costs in an episode, beside the policy that reads it: calls, tokens and FLOPs.
 
     python benchmarks/subgoal_cost.py [--episodes 0 1 2 3]
 
@@ -102,7 +102,7 @@ def language_flops(read: int, n_output: int) -> int:
 
 
 class CountingVLM:
-    """Stands in for a `VLM`: gives the answers it is told, and counts FLOPs of Qwen3-VL-4B for each question."""
+    """A fake `VLM`: returns the given answers, and counts FLOPs of Qwen3-VL-4B for each question."""
 
     def __init__(self, tiny: VLM) -> None:
         self.tiny, self.next_reply, self.flops = tiny, "", 0
@@ -120,7 +120,7 @@ class CountingVLM:
 
 
 class CountingClient:
-    """Stands in for google-genai's client."""
+    """A fake of google-genai's client."""
 
     def __init__(self, tokenizer: Any) -> None:
         self.tokenizer, self.next_reply, self.models = tokenizer, "", self

@@ -177,8 +177,8 @@ class MemoryTokens(TensorStruct):
 
     tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is undefined.
     metrics: scalars a memory reports of how it came to these tokens, detached.
-    ages: [b, budget] float32; how many frames ago the moment was that a token speaks of. None where tokens have no
-        moment, or the selection did not say what the current frame is.
+    ages: [b, budget] float32; frames between the frame of a token and the current one. None where tokens belong to
+        no frame, or the selection has no number of the current frame.
     losses: auxiliary losses by name, each [b], with gradients. Only training reads them (`train.losses`).
     cache: stored keys and values of earlier chunks (`CacheMemory`); None in training, and before the first chunk.
     """
@@ -193,10 +193,10 @@ class MemoryTokens(TensorStruct):
 
 @dataclass
 class Overlap(TensorStruct):
-    """What a new chunk is to agree with, as it is sampled: actions of the chunk before that are still to be executed.
+    """Actions of the chunk before that are still to be executed; the sampling of a new chunk is pulled towards them.
 
-    actions: [b, h, a]; normalised as the network predicts. weight: [b, h, a] in [0, 1]: how firmly each number is
-        meant; 0 where nothing was promised.
+    actions: [b, h, a]; normalised as the network predicts. weight: [b, h, a] in [0, 1]: how strongly the chunk is
+        pulled towards each number; 0 where the chunk before has none.
     """
 
     actions: Tensor

@@ -1,1 +1,1 @@
-"""The π0.5 backbone: it knows nothing of memory, and opens two doors for it (blocks and the per-layer hook)."""
+"""The π0.5 backbone: without memory, with two extension points for it (blocks and the per-layer hook)."""

@@ -12,24 +12,24 @@ PERIOD = 10_000.0
 
 
 def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) -> Tensor:
-    """What a transformer's layers make of the last frame of clips.
+    """Features of the last frame of clips, with attention over past frames in some of a transformer's layers.
 
     Args:
-        layers: timm's `Block`s. x: [n, t, p, d]. visible: [n, t] bool, False on frames that are not there.
-        every: each so-many-th layer looks through time, and at least the last; the past is dropped above them.
+        layers: timm's `Block`s. x: [n, t, p, d]. visible: [n, t] bool, False on padding.
+        every: layers with a multiple of this number attend over time, and at least the last; the past is dropped above.
 
     Returns:
         [n, p, d].
     """
     n, t = x.shape[:2]
     temporal = {i for i in range(len(layers)) if (i + 1) % every == 0} or {len(layers) - 1}
-    when = moments(t, x.shape[-1], x.device).to(x.dtype)[:, None]
+    times = encode_time(t, x.shape[-1], x.device).to(x.dtype)[:, None]
     before = (torch.ones(t, t, dtype=torch.bool, device=x.device).tril() & visible[:, None]) | torch.eye(
         t, dtype=torch.bool, device=x.device
-    )  # a frame that is not there sees itself, so that no row is empty
+    )  # padding attends to itself, so that no row is empty
     for i, layer in enumerate(layers):
         if i in temporal:
-            x = x + space_time(layer.attn, layer.norm1(x + when), before)
+            x = x + space_time(layer.attn, layer.norm1(x + times), before)
             x = x + layer.mlp(layer.norm2(x))
         else:
             x = layer(x.flatten(0, 1)).unflatten(0, (n, -1))
@@ -42,7 +42,7 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
     """Attention over patches whose values are mixed over time, [n, t, p, d] → [n, t, p, d].
 
     Args:
-        attention: timm's `Attention`. before: [n, t, t] bool, which frames a frame looks at.
+        attention: timm's `Attention`. before: [n, t, t] bool, which frames a frame attends to.
     """
     n, t, p = x.shape[:3]
     q, k, v = attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1)).permute(3, 0, 4, 1, 2, 5)  # n h t p c
@@ -55,8 +55,8 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
     return attention.proj(output.transpose(1, 2).flatten(2).unflatten(0, (n, t)))
 
 
-def moments(count: int, width: int, device: torch.device) -> Tensor:
-    """Where frames stand in time, [count, width] float32: sines and cosines that are exactly 0 at the last."""
+def encode_time(count: int, width: int, device: torch.device) -> Tensor:
+    """Sinusoidal encoding [count, width] float32 of the frames' times, exactly 0 at the last frame."""
     ages = torch.arange(1 - count, 1, device=device, dtype=torch.float32)
     rates = torch.exp(torch.arange(0, width, 2, device=device, dtype=torch.float32) * (-math.log(PERIOD) / width))
     angles = ages[:, None] * rates

@@ -110,7 +110,7 @@ class RMTLayer(RecurrentLayer):
         return torch.stack([a * cos - b * sin, a * sin + b * cos], -1).flatten(-2)
 
     def _attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        """Every slot looks at every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n, heads·h] float32."""
+        """Every slot attends to every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n, heads·h] float32."""
         b, n, heads, h = q.shape
         # Without a mask, the queries that share a key head are simply more queries of that head.
         q = q.unflatten(2, (self.kv_heads, -1)).permute(0, 2, 3, 1, 4).flatten(2, 3)  # b kv (g n) h

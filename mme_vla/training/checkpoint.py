@@ -226,7 +226,7 @@ def tidy(folder: Path, keep: KeepRule) -> None:
     """Remove the checkpoints that `keep` does not hold on to, and what a killed run left half-written or -removed."""
     for path in checkpoints_in(folder)[: -keep.last]:
         if not keep.every or step_of(path) % keep.every:
-            path.rename(folder / f".{path.name}.partial")  # whole or gone, for whoever looks
+            path.rename(folder / f".{path.name}.partial")  # a reader finds a full checkpoint or none
     for path in folder.glob(".step_*.partial"):
         shutil.rmtree(path)
 

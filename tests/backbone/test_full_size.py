@@ -29,7 +29,7 @@ VARIANTS = {
 
 @cache
 def full_size(variant: str) -> Policy:
-    """Shapes alone, and nobody changes them."""
+    """Shapes alone, which no test changes."""
     return build_policy(variant, backbone="pi05", device="meta")
 
 

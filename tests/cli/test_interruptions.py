@@ -102,7 +102,7 @@ def test_an_incomplete_plan_is_ignored(tmp_path: Path) -> None:
     assert not claim_plan(tmp_path, {"a": 2})
     (tmp_path / PLAN).write_text('{"epis')
     (tmp_path / "episodes" / "finished").touch()
-    assert not claim_plan(tmp_path, {"a": 1}), "somebody's work lies there"
+    assert not claim_plan(tmp_path, {"a": 1}), "another run's files are there"
     drop_plan(tmp_path)
     assert list(tmp_path.iterdir()) == []
 

@@ -1,4 +1,4 @@
-"""Composition of the YAML tree, and how a command answers what was mistyped."""
+"""Composition of the YAML tree, and the errors of mistyped overrides."""
 
 import subprocess
 import sys

@@ -75,7 +75,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 class Robot:
-    """Stands in for the reader's robot: shows noise, and keeps what it was told to do."""
+    """A fake of the reader's robot: its images are noise, and it keeps the commands."""
 
     def __init__(self) -> None:
         self.executed: list[np.ndarray] = []

@@ -47,7 +47,7 @@ NOT_RUN = {
     r"--checkpoint outputs/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/|mme-vla results verify": "needs the records of an evaluation",
     r"mme-vla probe card": "needs recorded episodes",
-    r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a driver that stands in for one",
+    r"benchmarks/\w+\.py (memory|update|chunk)": "needs a GPU, or a mock driver",
     r"python (dagger|grpo|reward_weighted)\.py": "tests/evaluation/test_rollouts.py or test_dagger_example.py runs it",
     r"mme_vla\.serve ": "serves until it is stopped",
     r"mme-vla harness ": "serves until it is stopped",

@@ -1,4 +1,4 @@
-"""Concepts, comparisons and answers of the documentation: their Python runs, their messages and figures are real."""
+"""Concepts, comparisons and FAQ of the documentation: their Python runs, their messages and figures are real."""
 
 import ast
 import csv

@@ -87,7 +87,7 @@ def in_process(folder: Path) -> np.ndarray:
             frames = {name: np.stack(lists[f"{name}_rgb_list"]) for name in ("front", "wrist")}
             first = episode.n_observed_frames == 0
             episode.observe(frames, states, np.arange(count) < count - 1 if first else False)
-        # Their videos differ in length, so LeRobot's loop asks for them one after the other: so does this.
+        # Their videos differ in length, so LeRobot's loop reads them one after the other, and so does this.
         chunks = np.stack([policy.act(episode) for episode in episodes])[:, : min(16, STEPS - len(done))]
         taken = [[env.step(action)[0] for action in chunk] for env, chunk in zip(envs, chunks, strict=True)]
         waiting = [{key: [step[key][0] for step in steps] for key in steps[0]} for steps in taken]

@@ -217,7 +217,7 @@ def test_missing_or_old_vulkan_says_what_to_install(
 
 
 class _Builder:
-    """Stands for the official package's builder."""
+    """A fake of the official package's builder."""
 
     made: dict[str, Any]
 

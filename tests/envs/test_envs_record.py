@@ -1,4 +1,4 @@
-"""Recording and showing: episodes of every suite drawn for real, datasets that can be read, runs that continue."""
+"""Recording and showing: rendered episodes of every suite, datasets that can be read, runs that resume."""
 
 import json
 from collections.abc import Iterator
@@ -43,7 +43,7 @@ def test_a_recorded_episode_reads_as_an_official_one(recorded: Path) -> None:
         assert (episode.length, episode.exec_start) == (about["stored"], about["video"])
         assert (episode.seed, episode.difficulty) == (about["seed"], "easy")
     assert frames[0].front.shape == (256, 256, 3)
-    assert frames[0].front.std() > 10, "the scene is not drawn"
+    assert frames[0].front.std() > 10, "the scene is not rendered"
     assert {frame.subgoals["simple_subgoal"] for frame in frames} == {"move forward-right"}
     assert not np.array_equal(frames[0].front, frames[-1].front)
     assert {path.suffix for path in (recorded / "previews").iterdir()} == {".png", ".mp4"}

@@ -1,4 +1,4 @@
-"""RouteStick: the row of discs and obstacles, the drawn route, the sense of each turn, and everything that fails."""
+"""RouteStick: the row of discs and obstacles, the sampled route, the sense of each turn, and everything that fails."""
 
 from itertools import pairwise
 

@@ -18,7 +18,7 @@ POSE = [0.1, 0.0, 0.2, np.pi, 0.0, 0.0]
 
 
 class Hand:
-    """Stands for the demonstrator: notes what it is told."""
+    """A fake demonstrator, which keeps the calls."""
 
     def __init__(self, reachable: bool = True) -> None:
         self.done: list[Any] = []

@@ -77,4 +77,4 @@ def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
         subgoals = {step["info/simple_subgoal"][()].decode() for step in episode.values() if "info" in step}
         first = episode["timestep_0/obs/front_rgb"][()]
     assert subgoals >= {"press the left button", "press the right button"}
-    assert first.std() > 10, "the scene is not drawn"
+    assert first.std() > 10, "the scene is not rendered"

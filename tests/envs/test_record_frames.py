@@ -1,4 +1,4 @@
-"""Demonstrations drawn at a chosen list of frames: which these are, what is stored of them, and who may read it."""
+"""Demonstrations rendered at a list of frames: which these are, what is stored, and which memories may read it."""
 
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,7 @@ def test_what_is_no_choice_of_frames_is_refused(at: Any, memory: Any) -> None:
 
 @pytest.fixture(scope="module")
 def recorded(renderer: str, tmp_path_factory: pytest.TempPathFactory) -> EpisodeRef:
-    """The shortest demonstration there is, drawn at its decisions and where the memory then reads."""
+    """The shortest demonstration, rendered at its decisions and at the frames that the memory then reads."""
     folder = tmp_path_factory.mktemp("frames")
     choice = FrameChoice("decisions", {"name": "framesamp", "budget": 64})
     job = Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3, frames=choice)

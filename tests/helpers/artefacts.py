@@ -57,7 +57,7 @@ def write_dataset(folder: Path) -> None:
 
 
 class SyntheticSource:
-    """As much of an `EpisodeSource` as a cache asks for."""
+    """The part of an `EpisodeSource` that a cache reads."""
 
     name, fingerprint = "fuzzed", "0123456789abcdef"
     lengths, exec_starts = np.array(LENGTHS), np.array([VIDEO, VIDEO])

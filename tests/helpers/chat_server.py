@@ -1,4 +1,4 @@
-"""A server on this machine that answers a model's requests, such as OpenAI's chat completions, as it is told to."""
+"""A local server of a model's endpoint, such as OpenAI's chat completions, with scripted responses."""
 
 import json
 import threading
@@ -24,7 +24,7 @@ def failure(code: int, message: str) -> Reply:
 
 
 class ChatServer:
-    """Answers in turn, or as `answer` says for each request; keeps every request and its key."""
+    """Returns `answers` in turn, or what `respond` makes of a request; keeps every request and its key."""
 
     def __init__(self) -> None:
         self.answers: list[Reply] = []
@@ -36,7 +36,7 @@ class ChatServer:
 
 @contextmanager
 def chat_server(path: str | None = "/v1/chat/completions") -> Iterator[ChatServer]:
-    """Serve until the end of the block. path: of the requests it answers; None for any."""
+    """Serve until the end of the block. path: of the requests it accepts; None for any."""
     state = ChatServer()
 
     class Handler(BaseHTTPRequestHandler):

@@ -1,4 +1,4 @@
-"""Helpers of the tests of tasks: scenes, what stands in for fingers and tool, and the stream of draws."""
+"""Helpers of the tests of tasks: scenes, fakes of fingers and tool, and the stream of random numbers."""
 
 from collections.abc import Sequence
 
@@ -147,7 +147,7 @@ def steps_of_demonstration(env: Task) -> int | None:
 
 
 class Tip:
-    """Stands in for the tool centre point; an evaluation means a step."""
+    """A fake tool centre point; an evaluation is a step."""
 
     def __init__(self, env: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         self._env, self._place = env, [0.4, 0.4, 0.07]

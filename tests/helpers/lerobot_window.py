@@ -37,7 +37,7 @@ def window_policy(views: bool, states: bool, **changed: Any) -> MMEPolicy:
 
 
 def weights(policy: MMEPolicy) -> dict[str, Tensor]:
-    """Tensors in LeRobot's names, each drawn from its name."""
+    """Tensors in LeRobot's names, each random with its name as the seed."""
     values = {}
     for name, shape in port_adapter(policy).shapes(policy.state_dict()).items():
         sampled = np.random.default_rng(zlib.crc32(name.encode())).normal(size=shape) * 0.1
@@ -86,7 +86,7 @@ def as_batch(policy: MMEPolicy) -> Batch:
 
 
 def their_chunk(views: bool, states: bool) -> Tensor:
-    """What LeRobot's own policy answers, [b, h, a]."""
+    """What LeRobot's policy returns, [b, h, a]."""
     import pytest
 
     from helpers.lerobot_pi05 import reduce_sizes

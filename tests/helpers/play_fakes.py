@@ -1,4 +1,4 @@
-"""A task without a simulator, for the rooms in which one plays: press the right blocks in the right order."""
+"""A task without a simulator for play sessions: press the right blocks in the right order."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -79,7 +79,7 @@ def made_up(count: int = 3, **options: Any) -> list[Recording]:
 
 
 class ReadsOneSlot(MMEPolicy):
-    """Answers with what stands at one slot of its memory, plus a little noise."""
+    """Returns the content of one slot of its memory, plus a little noise."""
 
     slot: int | None = 2
 

@@ -24,7 +24,7 @@ JOBS = [Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for
 
 
 def quick_policy(name: str, patch_size: int = 16, **overrides: Any) -> MMEPolicy:
-    """A policy that sees little, and so answers at once; 8 is the largest patch that every memory can be built on."""
+    """A policy with few patches, for speed; 8 is the largest patch that every memory can be built on."""
     return small_policy(name, backbone={"vision": {**SMALL_VISION, "patch_size": patch_size}}, **overrides)
 
 

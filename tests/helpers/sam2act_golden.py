@@ -1,4 +1,4 @@
-"""Golden cases of SAM2Act+: their files, drawn weights and inputs, and networks built to their sizes."""
+"""Golden cases of SAM2Act+: their files, random weights and inputs, and networks built to their sizes."""
 
 import json
 import zlib

@@ -128,7 +128,7 @@ def update_of(model: Policy, batch: Any, draws: dict[str, Tensor]) -> tuple[floa
 
 
 def compare(name: str, dtype: str) -> dict[str, Any]:
-    """One update of a model alone and shared, and a chunk that it then answers with."""
+    """One update of a model alone and sharded, and a chunk that it then returns."""
     alone = build_policy(name, policy={"compute_dtype": dtype, "augment": False})
     if hasattr(alone, "backbone") and hasattr(alone, "integration"):
         open_gates(alone)  # type: ignore[arg-type]

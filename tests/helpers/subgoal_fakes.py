@@ -29,7 +29,7 @@ def says(subgoal):
 
 
 class Client:
-    """Has google-genai's interface; answers with these outcomes in turn (exceptions are raised, functions called)."""
+    """Has google-genai's interface; returns these outcomes in turn (exceptions are raised, functions called)."""
 
     def __init__(self, *outcomes):
         self.outcomes, self.requests = list(outcomes), []

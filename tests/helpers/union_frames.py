@@ -41,7 +41,7 @@ def outcomes(records: list[EpisodeRecord]) -> list[tuple[Any, ...]]:
 
 
 def both_ways(policy: Any, subgoals: Any = None, base: Any = make_watched_env) -> list[dict[str, int]]:
-    """Roll with everything drawn and with what is needed; check that they agree; what was drawn, each way."""
+    """Run with all images rendered and with those needed; check that both agree; return what each rendered."""
     counts = []
     results = []
     for draw in ("all", "needed"):

@@ -211,7 +211,7 @@ def test_action_memory_reads_actions_and_no_image() -> None:
     assert torch.equal(base, remembered(255 - frames, states, actions))
     assert not torch.allclose(base, remembered(frames, states + (np.arange(33) == 8)[:, None], actions))
     assert not torch.allclose(base, remembered(frames, states, actions + (np.arange(33) == 28)[:, None]))
-    assert policy.frames_read(np.array([32]), 9).size == 0, "nothing has to be drawn for it"
+    assert policy.frames_read(np.array([32]), 9).size == 0, "nothing has to be rendered for it"
 
 
 def test_past_frames_without_states_are_refused() -> None:

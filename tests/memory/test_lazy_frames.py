@@ -38,7 +38,7 @@ def test_a_lazy_history_holds_what_an_eager_one_does(rendered: np.ndarray | None
     assert encoded == [] and len(lazy) == len(eager) == 6
     for indices in (np.array([[3, 1], [1, 0], [3, 2]]), np.array([[5, 3], [3, 0]])):
         assert torch.equal(lazy.gather(indices), eager.gather(indices))
-    assert encoded == [1, 3, 5], "each once, and none that nobody read"
+    assert encoded == [1, 3, 5], "each once, and none that no memory reads"
     with pytest.raises(UserError, match=r"no tokens of frames \[4\]"):
         lazy.gather(np.array([[4, 0]]))
 

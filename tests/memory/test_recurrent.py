@@ -1,4 +1,4 @@
-"""What recurrent memories promise beyond every memory: the window and the stream are one, and cost what they should."""
+"""What recurrent memories guarantee beyond every memory: window and stream are equal, and their costs."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Snapshots of a scene: images drawn afterwards are those that the episode shows."""
+"""Snapshots of a scene: images rendered afterwards are those that the episode shows."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from mme_vla.nano.demonstrations import record
 
 
 def test_marks_and_traces_are_rendered_as_the_episode_showed_them() -> None:
-    """Marks come and go, and belong to no thing of the task: what is drawn afterwards has them where they were."""
+    """Marks come and go, and belong to no thing of the task: an image rendered afterwards has them where they were."""
     from mme_vla.envs.make import make_env
     from mme_vla.envs.observations import RenderRequest
     from mme_vla.envs.recording.frames import FrameChoice

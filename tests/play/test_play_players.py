@@ -70,7 +70,7 @@ def test_a_reply_that_cannot_be_used_says_why(reply, reason):
 
 
 class Client:
-    """Has google-genai's interface; gives these answers in turn."""
+    """Has google-genai's interface; returns these answers in turn."""
 
     def __init__(self, *answers):
         self.answers, self.queries, self.models = list(answers), [], self

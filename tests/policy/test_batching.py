@@ -1,4 +1,4 @@
-"""The order of work: short frames, one batch, long videos; whoever is ready travels together."""
+"""The order of work: short frames, one batch, long videos; episodes that are ready share a batch."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ class Frames:
 
 
 def steps(schedule: Scheduler) -> list[str]:
-    """What one turn does, in words; whose frames are in asks for actions."""
+    """What one turn does, in words; an episode whose frames are in requests actions."""
     done = []
     for step in schedule.next_steps():
         if isinstance(step, Act):

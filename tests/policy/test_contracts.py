@@ -59,7 +59,7 @@ def test_a_task_of_the_library_keeps_a_tasks_contract() -> None:
     check_task("StopCube", difficulty="easy")
 
 
-# A check that cannot fail checks nothing: each is shown a part that breaks one promise.
+# Each check rejects a part that breaks one rule.
 
 
 class _LooksAhead(FrameSamp):

@@ -1,4 +1,4 @@
-"""A served policy answers as the policy itself would, to many clients at once, whatever some of them do."""
+"""A served policy returns what the policy itself would, to many clients at once, whatever some of them do."""
 
 import gc
 import socket

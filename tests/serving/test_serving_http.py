@@ -109,7 +109,7 @@ def test_what_the_policy_cannot_do_is_a_500(policy):
 
 def test_a_key_is_requested_but_not_for_health_and_metadata(policy):
     with Served(policy, api_key="right") as served:
-        for path in ("/healthz", "/metadata"):  # the challenge's client asks for the metadata without its key
+        for path in ("/healthz", "/metadata"):  # the challenge's client requests the metadata without its key
             assert ask(served, "GET", path)[0] == 200
         for header in (None, "Api-Key wrong", "Bearer right", "Api-Key rïght"):
             assert ask(served, "GET", "/stats", **({"Authorization": header} if header else {}))[0] == 401

@@ -70,7 +70,7 @@ def test_time_modulations_are_computed_once_and_anew_where_a_weight_has_changed(
 
 
 class Replayed:
-    """Stands in for a CUDA graph on a CPU: runs again what was captured, on the inputs that were captured."""
+    """A fake CUDA graph on a CPU: runs again what was captured, on the captured inputs."""
 
     def __init__(self, sampler: GraphSampler, inputs: graphs.Inputs) -> None:
         self._sampler, self._inputs = sampler, inputs

@@ -1,4 +1,4 @@
-"""Processes that share the weights: they learn what one process learns, whoever saves, resumes, stops or dies."""
+"""Sharded processes learn what one process learns, whichever saves, resumes, stops or dies."""
 
 import json
 from pathlib import Path

@@ -113,7 +113,7 @@ def test_results_tell_right_subgoals_and_distances_by_task() -> None:
 
 
 class Slow(SubgoalPredictor):
-    """Answers only when told to; keeps what it was asked."""
+    """Returns only when released; keeps the queries."""
 
     def __init__(self, interval: int = 1) -> None:
         super().__init__("simple", interval)

@@ -1,4 +1,4 @@
-"""The prompted model where things are not as they should be: settings, answers, kept files, interrupts."""
+"""Faults around the prompted model: settings, replies, cached files, interrupts."""
 
 import subprocess
 import sys

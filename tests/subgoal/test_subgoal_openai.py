@@ -1,4 +1,4 @@
-"""Prompted models behind any endpoint that speaks OpenAI's chat completions, against a server on this machine."""
+"""Prompted models behind any endpoint of OpenAI's chat completions, against a local server."""
 
 import base64
 import io

@@ -16,7 +16,7 @@ pytest.importorskip("transformers", reason="needs the extra vlm")
 
 
 class Scripted:
-    """Stands in for a `VLM`: gives these answers in turn and keeps the questions, batch by batch."""
+    """A fake `VLM`: returns these answers in turn and keeps the questions, batch by batch."""
 
     def __init__(self, *answers):
         self.answers, self.batches = list(answers), []

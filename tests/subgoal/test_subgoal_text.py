@@ -1,4 +1,4 @@
-"""Subgoals in words: prompts as in the paper, answers of every kind, histories and keyframes."""
+"""Subgoals in words: prompts as in the paper, replies of every kind, histories and keyframes."""
 
 import json
 import re

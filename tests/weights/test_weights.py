@@ -1,4 +1,4 @@
-"""The front door: loading, starting another variant, converting, and the statistics beside foreign weights."""
+"""The commands of weights: loading, starting another variant, converting, and the statistics beside foreign weights."""
 
 import json
 import shutil

@@ -33,7 +33,7 @@ class Present(PerceptualMemory):
 
         Args:
             grid, pooling: the current frame is grid×grid tokens.
-            budget: most memory tokens there is room for; None for as many as there are.
+            budget: maximum number of memory tokens; None for the number there are.
         """
         check_sizes("memory", grid=grid)
         enough = budget is None or budget >= grid**2

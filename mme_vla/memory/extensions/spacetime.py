@@ -55,7 +55,7 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
             every: each so-many-th layer of the tower looks through time, and at least its last.
             views: give the tower past images. states: hand over past states as tokens.
             state_dim: numbers a state is padded to before its layer.
-            budget: most memory tokens there is room for; None for as many as there are frames, which it takes at least.
+            budget: maximum number of memory tokens, at least the number of frames; None for that number.
         """
         super().__init__()
         check_sizes("memory", frames=frames, stride=stride, every=every, state_dim=state_dim)

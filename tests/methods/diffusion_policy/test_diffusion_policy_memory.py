@@ -1,4 +1,4 @@
-"""`diffusion_policy` with a memory: any of ours joins the condition through `film`, and decides about actions."""
+"""`diffusion_policy` with a memory: every memory joins the condition through `film`, and changes actions."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A memory bank's own promises, and MemoryVLA's sizes at full scale."""
+"""What a memory bank guarantees, and MemoryVLA's sizes at full scale."""
 
 import pytest
 import torch

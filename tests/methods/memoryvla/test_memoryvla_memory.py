@@ -168,7 +168,7 @@ def test_what_cannot_stand_there_is_refused_in_words() -> None:
 @pytest.mark.parametrize(("model", "words"), [("memoryvla", {}), ("memoryvla", {"memory": "ttt"}), ("openvla_oft", {})])
 def test_what_a_checkpoint_to_start_from_lacks_is_rendered(model: str, words: dict[str, Any]) -> None:
     """Training does not draw what `init_from` will replace: openvla-7b has neither heads nor banks."""
-    torch.use_deterministic_algorithms(True)  # memory that nobody has written is nan then
+    torch.use_deterministic_algorithms(True)  # uninitialised memory is nan then
     try:
         policy = build_from_config(compose("policy", policy_words(model, words)), fresh_backbone=False)
     finally:

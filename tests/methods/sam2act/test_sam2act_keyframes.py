@@ -151,7 +151,7 @@ class ManyTasks:
 def sampled_shares(
     episodes: dict[str, list[list[int]]], length: int, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[dict[str, float], dict[tuple[int, int], float]]:
-    """How often tasks, and places (episode, links of the chain) are drawn."""
+    """How often tasks, and places (episode, links of the chain) are sampled."""
     source: Any = ManyTasks(episodes)
 
     def keep(path: Path) -> Any:
@@ -182,7 +182,7 @@ def test_the_first_stage_draws_a_task_and_then_one_of_its_transitions(monkeypatc
 def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_short(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of `half` every second draw is thrown away, and then a task is drawn anew: it is seen half as often."""
+    """Of `half` every second sample is rejected, and then a task is sampled anew: it occurs half as often."""
     shares, places = sampled_shares({"half": [[5, 1]], "whole": [[5], [5, 5, 5]], "never": [[2]]}, 3, monkeypatch)
     assert shares == pytest.approx({"half": 1 / 3, "whole": 2 / 3}, abs=0.03)
     assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(1 / 3, abs=0.03)

@@ -134,7 +134,7 @@ def test_adapters_reach_queries_and_values_alone(golden: dict[str, np.ndarray]) 
 
 
 class Rendered:
-    """The golden network: its sizes from the names' shapes, its weights and inputs drawn by rule."""
+    """The golden network: its sizes from the names' shapes, its weights and inputs random by rule."""
 
     def __init__(self) -> None:
         described = meta()

@@ -55,7 +55,7 @@ class MMEVLAConfig(PreTrainedConfig):
         """LeRobot asks at construction; `check_robot` can say more, once the embodiment is known."""
 
     def check_robot(self, robot: Embodiment) -> None:
-        """Make sure that the dataset or environment has what this robot's policy reads and answers.
+        """Make sure that the dataset or environment has what this robot's policy reads and returns.
 
         Raises:
             UserError: a camera, the state or the action is missing, or of another width.

@@ -27,7 +27,7 @@ def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
 
 
 def features_of(robot: Embodiment) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
-    """What LeRobot is told that a robot's policy reads and answers; images may have any size."""
+    """The features that LeRobot lists for a robot's policy; images may have any size."""
     image_features = {
         f"observation.images.{camera.key or camera.name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE))
         for camera in robot.cameras

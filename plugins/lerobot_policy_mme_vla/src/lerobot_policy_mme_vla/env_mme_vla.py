@@ -22,7 +22,7 @@ from mme_vla.errors import UserError
 
 VIEWS = {"image": "front_rgb_list", "wrist_image": "wrist_rgb_list"}
 STATE, ACTION = ROBOMME_JOINT.state.width, ROBOMME_JOINT.action.width
-LONGEST_VIDEO = 2000  # frames; LeRobot asks for the most steps before it knows the videos of its batch
+LONGEST_VIDEO = 2000  # frames; LeRobot reads the step limit before it has the videos of its batch
 
 
 class RoboMMEWithVideo(gym.Env):

@@ -116,7 +116,7 @@ class MMEVLAPolicy(PreTrainedPolicy):
         prev_chunk_left_over: Tensor | None = None,
         **_: Any,
     ) -> Tensor:
-        """Chunks [b, h, w] for what is seen now, absolute.
+        """Chunks [b, h, w] of absolute actions for the current observations.
 
         Args:
             inference_delay: actions of the chunk before that are executed until this one is there.
@@ -124,12 +124,12 @@ class MMEVLAPolicy(PreTrainedPolicy):
                 end, with which LeRobot fills up, are none.
 
         Raises:
-            UserError: a policy that cannot agree with what is promised, or that reads which actions were executed.
+            UserError: a policy without real-time chunking, or one that reads which actions were executed.
         """
         rows = self._see(batch)
         if prev_chunk_left_over is not None:
             if not self.supports_rtc():
-                raise UserError("This policy cannot agree with a chunk under way: use --inference.type=sync.")
+                raise UserError("This policy does not support real-time chunking: use --inference.type=sync.")
             action_prefix = np.atleast_3d(prev_chunk_left_over.float().cpu().numpy())
             action_prefix = action_prefix.reshape(-1, *prev_chunk_left_over.shape[-2:])
             for row, actions in zip(rows, action_prefix, strict=True):
@@ -186,10 +186,10 @@ class MMEVLAPolicy(PreTrainedPolicy):
         dataset_meta: Any = None,
         **_: Any,
     ) -> Self:
-        """Load what `save_pretrained` wrote; no weight is drawn first, and every tensor has to fit.
+        """Load what `save_pretrained` wrote; no weight is initialised first, and every tensor has to fit.
 
         Raises:
-            UserError: no checkpoint of this kind, a damaged one, or plugins that nobody imported
+            UserError: no checkpoint of this kind, a damaged one, or a plugin that is not imported
                 (`--policy.discover_packages_path=<package>` imports one).
         """
         folder = local_folder(pretrained_name_or_path, revision, token)

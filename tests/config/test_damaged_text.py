@@ -1,4 +1,4 @@
-"""Logs, answers, prompts and states that cannot be: one sentence each, never a traceback."""
+"""Damaged logs, replies, prompts and states: one sentence each, never a traceback."""
 
 import json
 from pathlib import Path

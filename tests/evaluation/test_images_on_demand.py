@@ -1,4 +1,4 @@
-"""Rollouts draw what is looked at, and nothing changes: actions and outcomes are those of drawing everything."""
+"""Rollouts render what is read, and nothing changes: actions and outcomes are those of rendering everything."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,7 +34,7 @@ def test_rendering_what_is_needed_changes_no_action(name: str) -> None:
     *everything, video, full = both_ways(policy)
     assert everything == [{"front": n, "wrist": n} for n in FRAMES]
     chunks = -(-STEPS // 16)
-    last = STEPS % 16 > 0  # the step limit cuts the last chunk short: nobody acts on its end
+    last = STEPS % 16 > 0  # the step limit cuts the last chunk short: no policy acts on its end
     assert video["wrist"] == full["wrist"] == 1 + chunks - last
     memory = policy.memory
     if memory is None:
@@ -89,7 +89,7 @@ def test_a_predictor_that_watches_gets_every_frame_of_its_camera() -> None:
 
 
 class Glancer(Watcher):
-    """Looks at the current image alone."""
+    """Reads the current image alone."""
 
     sees_video = sees_passing = False
 

@@ -1,4 +1,4 @@
-"""Every door of a backbone, for an integration of one's own: trained through, sampled through, and its weights."""
+"""Every extension point of a backbone, for an integration of one's own: training, sampling and weights."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -59,7 +59,7 @@ class BesideInASeparateExpert(Beside):
 
 
 class Everything(BesideInASeparateExpert):
-    """All doors at once."""
+    """All extension points at once."""
 
     def __init__(self, backbone: Any) -> None:
         super().__init__(backbone)
