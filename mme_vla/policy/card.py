@@ -5,6 +5,7 @@ from typing import Any
 
 from torch import nn
 
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import brief, require
 
 CARD_FILE = "README.md"
@@ -53,17 +54,29 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
 
 def example(config: Mapping[str, Any]) -> list[str]:
     """Lines of Python from the weights to an action, with grey frames for the user's own."""
-    robot = config.get("embodiment") or {}
-    views = ", ".join(f'"{camera}": frame' for camera in robot.get("cameras") or ("front", "wrist"))
-    width = (robot.get("state") or {}).get("width", 8)
+    robot = embodiment_of(config)
+    frames = {camera.name: "frame" for camera in robot.cameras}
+    lines = ["frame = np.full((1, 256, 256, 3), 127, np.uint8)  # yours, of each camera"]
+    if robot.readings:
+        lines += [
+            "depth = np.full((1, 256, 256, 1), 500, np.int16)  # in millimetres",
+            "pose = np.eye(3, 4, dtype=np.float32)[None]  # from the world to the camera, in OpenCV's axes",
+        ]
+        frames |= {name: "depth" if name.endswith("_depth") else "pose" for name in robot.readings}
+    options: list[str] = []
+    if robot.action.choice:
+        options = ['episode.options = [Option("a", "press the button")]  # those of the environment']
     return [
         "import numpy as np",
         "from mme_vla import Policy",
+        *(["from mme_vla.embodiment.action_space import Option"] if options else []),
         "",
         'policy = Policy.from_pretrained("<this repository or folder>")',
         'episode = policy.start_episode("the goal in words", seed=7)',
-        "frame = np.full((1, 256, 256, 3), 127, np.uint8)  # yours, of each camera",
-        f"episode.observe({{{views}}}, np.zeros((1, {width}), np.float32))  # and the robot's state",
+        *options,
+        *lines,
+        f"frames = {{{', '.join(f'"{name}": {value}' for name, value in frames.items())}}}",
+        f"episode.observe(frames, np.zeros((1, {robot.state.width}), np.float32))  # and the robot's state",
         "chunk = policy.act(episode)  # the next actions",
     ]
 

@@ -3,12 +3,15 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from huggingface_hub import ModelCard
 
 from mme_vla import UserError
+from mme_vla.policy.build import build_policy
 from mme_vla.policy.card import model_card
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.run_folders import SHIPPED, find_run
 from mme_vla.testing.small import small_policy, unit_stats
 
 
@@ -39,15 +42,27 @@ def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None
     assert "| note | one seed |" in card.text
 
 
-@pytest.mark.parametrize("model", ["pi05", "framesamp_modul"])
-def test_the_example_of_a_card_runs_to_an_action(model: str, tmp_path: Path) -> None:
-    saved = small_policy(model)
-    saved.processor.stats = unit_stats()
+@pytest.mark.parametrize(
+    ("model", "settings"),
+    [("pi05", {}), ("framesamp_modul", {}), ("pi05", {"embodiment": "robomme_choice"}), ("sam2act_plus", {})],
+)
+def test_the_example_of_a_card_runs_to_an_action(model: str, settings: dict, tmp_path: Path) -> None:
+    """Of robots that choose among options and that read depth as well."""
+    saved = build_policy(model, backbone="sam2act_tiny" if model == "sam2act_plus" else "tiny", **settings)
+    saved.require_processor().stats = unit_stats(saved.embodiment)
     saved.save_pretrained(tmp_path)
     (block,) = re.findall(r"```python\n(.*?)```", (tmp_path / "README.md").read_text(), re.DOTALL)
     space: dict = {}
     exec(block.replace("<this repository or folder>", str(tmp_path)), space)
-    assert space["chunk"].shape[-1] == 8
+    assert space["chunk"].shape[-1] == saved.embodiment.action.width
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_example_of_a_shipped_card_runs_to_an_action(name: str) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", (find_run(Path(name)) / "README.md").read_text(), re.DOTALL)
+    space: dict = {}
+    exec(block, space)
+    assert np.isfinite(space.get("chunk", space.get("choice"))).all()
 
 
 @pytest.mark.parametrize("key", ["recipe", "results"])
