@@ -100,7 +100,7 @@ def evidence(made: list[Board]) -> str:
         listed = [*board_page.notes(board), *board_page.separating(board)]
         actions = "" if board.action_space == CHOICES else f", `{board.action_space}`"
         parts.append("\n".join([f"## Split `{board.split}`{actions}", "", *(f"- {line}" for line in listed), ""]))
-        parts += [to_markdown(table) for table in board_page.all_tables(board) if table.rows]
+        parts += [to_markdown(table) for table in board_page.all_tables(board)]
     return "\n".join(parts)
 
 

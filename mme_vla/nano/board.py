@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import combinations, pairwise
 from math import factorial, prod
+from typing import Literal
 
 import numpy as np
 
@@ -227,7 +228,28 @@ class Board:
             floors = [row for row in ranked if row.kind == "floor" and row.facts.trained]
             pairs += [(other, row) for row in local for other in (ranked[0], *floors) if other is not row]
         unique = {frozenset(row.name for row in pair): pair for pair in pairs}
-        made = compare_all([(first.method, second.method) for first, second in unique.values()], self._once)
+        return self._compared(list(unique.values()))
+
+    def variants(self, part: Literal["memory", "integration"]) -> list[Comparison]:
+        """Pairs of `<memory>_<integration>` at the default budget that differ in this part alone.
+
+        Of memories with several integrations. P values and intervals as in `neighbours`.
+        """
+        rows = [row for row in self.of_kind("policy") if not row.budget and not row.is_local]
+        parts = {row.name: row.name.rpartition("_")[::2] for row in rows}
+        count = Counter(memory for memory, _ in parts.values())
+        rows = [row for row in rows if parts[row.name][0] and count[parts[row.name][0]] > 1]
+        varied = ("memory", "integration").index(part)
+        rows.sort(key=lambda row: parts[row.name][1 - varied])
+        pairs = []
+        for first, second in combinations(rows, 2):
+            mine, other = parts[first.name], parts[second.name]
+            if mine[varied] != other[varied] and mine[1 - varied] == other[1 - varied]:
+                pairs.append((first, second))
+        return self._compared(pairs)
+
+    def _compared(self, pairs: Sequence[tuple[Row, Row]]) -> list[Comparison]:
+        made = compare_all([(first.method, second.method) for first, second in pairs], self._once)
         return [replace(c, interval=percentiles(self.sampled[c.first] - self.sampled[c.second])) for c in made]
 
     @cached_property

@@ -235,25 +235,44 @@ def published_figure(board: Board) -> str:
         return svg(canvas)
 
 
+def neighbours(board: Board) -> Table:
+    """Rows and those beside them in the ranking."""
+    return replace(comparison_table(board.neighbours()), title="Neighbours in the ranking, percentage points")
+
+
+def variants(board: Board) -> list[Table]:
+    """Integrations of one memory, and memories with one integration, where there are several."""
+    integrations, memories = (comparison_table(board.variants(part)) for part in ("integration", "memory"))
+    tables = [
+        replace(integrations, title="Integrations of a memory, percentage points"),
+        replace(memories, title="Memories with an integration, percentage points"),
+    ]
+    return [table for table in tables if table.rows]
+
+
 def all_tables(board: Board) -> list[Table]:
-    """Every table of the board."""
-    return [ranking(board), targets(board), comparison_table(board.neighbours()), tasks(board), trainings(board),
-            separations(board), published(board), agreements(board)]  # fmt: skip
+    """Every table of the board that has rows."""
+    tables = [ranking(board), targets(board), neighbours(board), *variants(board), tasks(board), trainings(board),
+              separations(board), published(board), agreements(board)]  # fmt: skip
+    return [table for table in tables if table.rows]
 
 
 def page(board: Board) -> str:
     """The board as one page of HTML, which loads nothing."""
-    ranks, aims, pairs, by_task, by_training, differ, beside, agree = all_tables(board)
+    corrected = "P values are corrected by Holm for the number of pairs of a table."
     sections = [
-        Section("Ranking", success_figure(board), [ranks], paragraphs=notes(board)),
-        *([Section("Targets", tables=[aims])] if aims.rows else []),
-        Section("Neighbours", tables=[pairs], caption="P values are corrected by Holm for the number of pairs."),
-        Section("Tasks", tables=[by_task]),
-        *([Section("Trainings", tables=[by_training])] if by_training.rows else []),
-        Section("Do memories differ?", budget_figure(board), [differ], paragraphs=separating(board)),
+        Section("Ranking", success_figure(board), [ranking(board)], paragraphs=notes(board)),
+        Section("Targets", tables=[targets(board)]),
+        Section("Neighbours", tables=[neighbours(board)], caption=corrected),
+        Section("Memory and integration", tables=variants(board), headed=True, caption=corrected),
+        Section("Tasks", tables=[tasks(board)]),
+        Section("Trainings", tables=[trainings(board)]),
+        Section("Do memories differ?", budget_figure(board), [separations(board)], paragraphs=separating(board)),
     ]
+    sections = [section for section in sections if any(table.rows for table in section.tables)]
     if board.published:
-        sections.append(Section("Beside the published ranking", published_figure(board), [beside, agree]))
+        beside = [published(board), agreements(board)]
+        sections.append(Section("Beside the published ranking", published_figure(board), beside))
     return html_page("nanoMME-16", sections, f"{len(board.rows)} rows", sortable=True)
 
 

@@ -17,6 +17,7 @@ from mme_vla import UserError
 from mme_vla.cli import board as board_command
 from mme_vla.cli import nano as nano_command
 from mme_vla.envs.metadata import episodes
+from mme_vla.evaluation.results.aggregate import percentiles
 from mme_vla.evaluation.store import claim_run, read_folders
 from mme_vla.nano import board_page
 from mme_vla.nano.board import Board, Row, homogeneity, kendall, pooled, smallest_p, spearman
@@ -176,6 +177,25 @@ def test_separations_state_deviation_noise_floor_and_ceiling(board: Board) -> No
     assert first.floor == pytest.approx(100 / 3) and made[1].floor == 0
     assert first.noise == pytest.approx(board.noise()) and first.repeated == 3 and first.p_repeated is None
     assert board_page.separating(board)[0].endswith("the 3 trained policies differ in 0 of 4 tasks (p < 0.05).")
+
+
+def test_variants_are_compared_that_differ_in_memory_or_integration_alone(rows: Path, tmp_path: Path) -> None:
+    """Memories with one integration, other budgets, floors and the user's rows are left out."""
+    for row, won in {"framesamp_context": 2, "ttt_expert": 1, "ttt_context": 0, "framesamp_modul@4": 1}.items():
+        write_training(tmp_path / "more", row, 0, won)
+    write_training(tmp_path / "mine", "framesamp_expert", 0, 3)
+    board = Board(read_rows([rows, tmp_path / "more"], local=[tmp_path / "mine"]), samples=50)
+    pairs = {part: [(c.first, c.second) for c in board.variants(part)] for part in ("memory", "integration")}
+    assert pairs["integration"] == [
+        ("framesamp_modul", "framesamp_context"),
+        ("ttt_modul", "ttt_expert"),
+        ("ttt_modul", "ttt_context"),
+        ("ttt_expert", "ttt_context"),
+    ]
+    assert pairs["memory"] == [("framesamp_context", "ttt_context"), ("framesamp_modul", "ttt_modul")]
+    comparison = board.variants("memory")[0]
+    assert comparison.difference == pytest.approx(200 / 3)
+    assert comparison.interval == percentiles(board.sampled["framesamp_context"] - board.sampled["ttt_context"])
 
 
 def test_budgets_are_separate_tables(rows: Path, tmp_path: Path) -> None:
