@@ -94,9 +94,8 @@ def run(args: argparse.Namespace, split: str, trained: Sequence[Path]) -> None:
     shipped = SHIPPED / next((row[0].table for row in local.values()), split)
     rows = read_rows([shipped], local=[*folders, *trained]) if shipped.is_dir() else local
     board = Board(rows, samples=args.samples or SAMPLES)
-    pairs = board.neighbours()
-    tables = [board_page.ranking(board, brief=True), board_page.targets(board)]
-    for table in [*tables, *([comparison_table(pairs)] if pairs else [])]:
+    pairs = comparison_table(board.neighbours())
+    for table in (board_page.ranking(board, brief=True), board_page.targets(board), pairs):
         if table.rows:
             print_table(table, 120)
     for line in [*board_page.notes(board), *board_page.separating(board), *board_page.standing(board)]:

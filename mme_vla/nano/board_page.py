@@ -57,12 +57,11 @@ def trainings(board: Board) -> Table:
     scopes = [board.protocol.tasks, *suites, *((task,) for task in board.protocol.tasks)]
     rows: list[list[str]] = []
     for row in board.rows:
-        several = row.method.trainings if len(row.method.trainings) > 1 else []
-        solved = [sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes]  # each [trainings]
-        for number, runs in enumerate(several):
-            identity = runs[0].key.training
-            seed = "–" if identity is None else str(identity.seed)
-            rows.append([row.name, seed, *(f"{of_scope[number]:g}" for of_scope in solved)])
+        seeds = [runs[0].key.training.seed for runs in row.method.trainings if runs[0].key.training]
+        if len(seeds) > 1:
+            solved = [sum(row.outcomes(task).sum(0) for task in scope) for scope in scopes]  # each [trainings]
+            for seed, *counts in zip(seeds, *solved, strict=True):
+                rows.append([row.name, str(seed), *(f"{count:g}" for count in counts)])
     columns = ["row", "training seed", "all", *board.protocol.suites, *board.protocol.tasks]
     return Table("Scenes solved by each training", columns, rows)
 
@@ -235,11 +234,6 @@ def published_figure(board: Board) -> str:
         return svg(canvas)
 
 
-def neighbours(board: Board) -> Table:
-    """Rows and those beside them in the ranking."""
-    return replace(comparison_table(board.neighbours()), title="Neighbours in the ranking, percentage points")
-
-
 def variants(board: Board) -> list[Table]:
     """Integrations of one memory, and memories with one integration, where there are several."""
     integrations, memories = (comparison_table(board.variants(part)) for part in ("integration", "memory"))
@@ -252,7 +246,8 @@ def variants(board: Board) -> list[Table]:
 
 def all_tables(board: Board) -> list[Table]:
     """Every table of the board that has rows."""
-    tables = [ranking(board), targets(board), neighbours(board), *variants(board), tasks(board), trainings(board),
+    pairs = comparison_table(board.neighbours())
+    tables = [ranking(board), targets(board), pairs, *variants(board), tasks(board), trainings(board),
               separations(board), published(board), agreements(board)]  # fmt: skip
     return [table for table in tables if table.rows]
 
@@ -263,7 +258,7 @@ def page(board: Board) -> str:
     sections = [
         Section("Ranking", success_figure(board), [ranking(board)], paragraphs=notes(board)),
         Section("Targets", tables=[targets(board)]),
-        Section("Neighbours", tables=[neighbours(board)], caption=corrected),
+        Section("Neighbours", tables=[comparison_table(board.neighbours())], caption=corrected),
         Section("Memory and integration", tables=variants(board), headed=True, caption=corrected),
         Section("Tasks", tables=[tasks(board)]),
         Section("Trainings", tables=[trainings(board)]),
