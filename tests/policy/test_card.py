@@ -44,11 +44,16 @@ def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None
 
 @pytest.mark.parametrize(
     ("model", "settings"),
-    [("pi05", {}), ("framesamp_modul", {}), ("pi05", {"embodiment": "robomme_choice"}), ("sam2act_plus", {})],
+    [
+        ("pi05", {}),
+        ("framesamp_modul", {}),
+        ("pi05", {"embodiment": "robomme_choice"}),
+        ("sam2act_plus", {"backbone": "sam2act_tiny"}),
+    ],
 )
 def test_the_example_of_a_card_runs_to_an_action(model: str, settings: dict, tmp_path: Path) -> None:
     """Of robots that choose among options and that read depth as well."""
-    saved = build_policy(model, backbone="sam2act_tiny" if model == "sam2act_plus" else "tiny", **settings)
+    saved = build_policy(model, **{"backbone": "tiny", **settings})
     saved.require_processor().stats = unit_stats(saved.embodiment)
     saved.save_pretrained(tmp_path)
     (block,) = re.findall(r"```python\n(.*?)```", (tmp_path / "README.md").read_text(), re.DOTALL)
