@@ -16,7 +16,7 @@ def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) 
 
     Args:
         layers: timm's `Block`s. x: [n, t, p, d]. visible: [n, t] bool, False on padding.
-        every: layers with a multiple of this number attend over time, and at least the last; the past is dropped above.
+        every: interval of the layers that attend over time, at least the last one; the past is dropped above them.
 
     Returns:
         [n, p, d].

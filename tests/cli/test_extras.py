@@ -238,5 +238,5 @@ def test_every_command_is_among_the_cases() -> None:
 
 
 def test_each_extra_is_among_the_cases() -> None:
-    # A URL needs a key.
+    # The services of the others need a key.
     assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"", "dev", "gemini", "openai", "wandb"}

@@ -56,7 +56,7 @@ def displayed(frames: dict[str, list[Any]], camera: str) -> list[int]:
 def test_frames_are_rendered_where_they_are_requested(space: str, actions: list[np.ndarray]) -> None:
     full, infos = run_episode(space, actions, None)
     count = len(full["joint_state_list"])
-    # The newest frame of each call: of a motion that ends with a grip the last one, of unknown number.
+    # The newest frame of each call. The number of the last frame of a motion that ends with a grip is unknown before.
     request = RenderRequest({"front": frozenset({2, 3})}, now=("wrist",), grounded=False)
     some, fewer = run_episode(space, actions, request)
     assert displayed(full, "front") == displayed(full, "wrist") == list(range(count))

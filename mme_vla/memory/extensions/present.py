@@ -33,7 +33,7 @@ class Present(PerceptualMemory):
 
         Args:
             grid, pooling: the current frame is grid×grid tokens.
-            budget: maximum number of memory tokens; None for the number there are.
+            budget: maximum number of memory tokens, at least grid²; None for grid².
         """
         check_sizes("memory", grid=grid)
         enough = budget is None or budget >= grid**2

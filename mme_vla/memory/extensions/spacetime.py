@@ -29,8 +29,8 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
     """Views of `frames` frames for the tower, and their states as so many tokens; `select` names the frames.
 
-    No cache serves it: it would have to hold what every layer that looks through time makes of every frame of every
-    camera, where others store one pooled grid of one camera. So images are read anew, in training too.
+    No cache serves it: it would have to hold the features of every frame of every camera in each layer that attends
+    over time, where others store one pooled grid of one camera. So images are read anew, in training too.
     """
 
     timed = True
@@ -47,15 +47,15 @@ class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
         state_dim: int = 32,
         budget: int | None = None,
     ) -> None:
-        """Say what is looked at.
+        """Configure the frames, and what is read of them.
 
         Args:
             d_vision: width of a vision token, to which a state is padded on its way. width: of a memory token.
             frames: how many, the current one among them. stride: frames between two.
-            every: each so-many-th layer of the tower looks through time, and at least its last.
+            every: interval of the tower's layers that attend over time, at least the last one.
             views: give the tower past images. states: hand over past states as tokens.
             state_dim: numbers a state is padded to before its layer.
-            budget: maximum number of memory tokens, at least the number of frames; None for that number.
+            budget: maximum number of memory tokens, at least `frames`; None for `frames`.
         """
         super().__init__()
         check_sizes("memory", frames=frames, stride=stride, every=every, state_dim=state_dim)
