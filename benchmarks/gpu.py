@@ -17,7 +17,7 @@ import gc
 import json
 import statistics
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,6 +35,7 @@ from mme_vla.integration.base import MEMORY_VISIBILITY
 
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0
 NOT_MEASURED = "not measured"
+PARTS = ("training", "feeding", "chunk", "lerobot", "attention")
 Projections = tuple[Tensor, Tensor, Tensor]  # queries, keys, values
 
 
@@ -84,7 +85,7 @@ def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), wi
         if backend == "flex" and setup.device.type != "cuda":
             rows[backend] = NOT_MEASURED  # it has no backward pass there
             continue
-        mask_layout, tensors, exact = _attention_case(spans, setup, width)
+        mask_layout, tensors, exact, gradients = _attention_case(spans, setup, width)
         mask = build_mask(mask_layout, setup.dtype, backend, compiled=False)
 
         def both(tensors: Projections = tensors, mask: Any = mask) -> Tensor:
@@ -98,23 +99,34 @@ def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), wi
         rows[backend] = {
             "ms": statistics.median(milliseconds(both, setup.rounds, 2, setup.device)),
             "error": float((output.float() - exact).abs().max()),
+            "gradient_error": max(
+                float((x.grad.float() - expected).abs().max() / expected.abs().max())
+                for x, expected in zip(tensors, gradients, strict=True)
+                if x.grad is not None
+            ),
         }
     return rows
 
 
-def _attention_case(spans: Sequence[Span], setup: Setup, width: int) -> tuple[MaskLayout, Projections, Tensor]:
+def _attention_case(
+    spans: Sequence[Span], setup: Setup, width: int
+) -> tuple[MaskLayout, Projections, Tensor, list[Tensor]]:
+    """Rows that attend, their queries, keys and values, and in float32 the answers and the gradients of their sum."""
     n = sum(span.length for span in spans)
     generator = torch.Generator().manual_seed(n)
     valid = (torch.rand(setup.batch, n, generator=generator) < 0.8).to(setup.device)
     mask_layout = MaskLayout.of(spans, spans, valid, MEMORY_VISIBILITY)
     sizes = [(setup.batch, n, heads, width) for heads in (8, 1, 1)]
     first, second, third = (torch.randn(size, generator=generator).to(setup.device, setup.dtype) for size in sizes)
-    q, k, v = (x.float().transpose(1, 2) for x in (first, second, third))
+    leaves = [x.float().requires_grad_() for x in (first, second, third)]
+    q, k, v = (x.transpose(1, 2) for x in leaves)
     logits = (q @ k.transpose(-1, -2) * width**-0.5).masked_fill(
         ~mask_layout.expand(mask_layout.visible)[:, None], -torch.inf
     )
     exact = (logits.softmax(-1) @ v).transpose(1, 2).flatten(2)
-    return mask_layout, (first.requires_grad_(), second.requires_grad_(), third.requires_grad_()), exact
+    exact.sum().backward()
+    tensors = (first.requires_grad_(), second.requires_grad_(), third.requires_grad_())
+    return mask_layout, tensors, exact.detach(), [x.grad for x in leaves if x.grad is not None]
 
 
 def nan_sweep(setup: Setup, lengths: Sequence[int], width: int = 256) -> list[str]:
@@ -123,7 +135,7 @@ def nan_sweep(setup: Setup, lengths: Sequence[int], width: int = 256) -> list[st
     for n_images in lengths:
         spans = [Span("memory", 64), Span("images", n_images), Span("prompt", 48), Span("action", 16)]
         for backend in ("sdpa", "varlen") if setup.device.type != "cuda" else ("sdpa", "flex", "varlen"):
-            mask_layout, tensors, _ = _attention_case(spans, setup, width)
+            mask_layout, tensors, *_ = _attention_case(spans, setup, width)
             output = attend(*tensors, build_mask(mask_layout, setup.dtype, backend, compiled=False))
             functional.mse_loss(output, torch.zeros_like(output)).backward()
             if not all(torch.isfinite(x).all() for x in (output, *(x.grad for x in tensors if x.grad is not None))):
@@ -133,40 +145,41 @@ def nan_sweep(setup: Setup, lengths: Sequence[int], width: int = 256) -> list[st
 
 def judge(result: dict[str, Any]) -> list[str]:
     """What is below the goals."""
-    failures = [f"NaN: {where}" for where in result["nan"]]
+    failures = [f"NaN: {where}" for where in result.get("nan", ())]
     for model, row in result["models"].items():
-        update, ways = row["training"], row["chunk"]
-        if not update["finite"]:
+        update = row.get("training")
+        if update and not update["finite"]:
             failures.append(f"{model}: a loss is no number")
-        if update["mfu"] is not None and update["mfu"] < GOAL_MFU:
+        if update and update["mfu"] is not None and update["mfu"] < GOAL_MFU:
             failures.append(f"{model}: MFU {update['mfu']:.0%} is below {GOAL_MFU:.0%}")
-        best = min(way["p50_ms"] for way in ways.values())
+        best = min((way["p50_ms"] for way in row.get("chunk", {}).values()), default=0.0)
         if result["device"] == "cuda" and best > GOAL_CHUNK_MS:
             failures.append(f"{model}: a chunk takes {best:.1f} ms, more than {GOAL_CHUNK_MS:.0f}")
     return failures
 
 
-def show(result: dict[str, Any]) -> None:
-    """The table."""
-    print(f"{result['machine']}; cuDNN {result['cudnn']}")
-    for model, row in result["models"].items():
+def show_model(model: str, row: dict[str, Any]) -> None:
+    """Print what of one model was measured."""
+    if "training" in row:
         print(_of_update(model, row["training"]))
-        if "feeding" in row:
-            fed = row["feeding"]
-            print(f"  from {fed['workers']} reading processes: {fed['samples_per_s']:.1f} samples/s, "
-                  f"{fed['waiting']:.0%} of the time waiting for data")  # fmt: skip
-        _show_chunks(row["chunk"])
-    if isinstance(result["lerobot"], str):
-        print("LeRobot's PI05:", result["lerobot"])
-    else:
-        update = result["lerobot"]["training"]
-        gib = NOT_MEASURED if update["peak_gib"] is None else f"{update['peak_gib']:.1f} GiB"
-        print(f"LeRobot's PI05: update {update['ms']:.1f} ms, {update['samples_per_s']:.1f} samples/s, peak {gib}")
-        _show_chunks(result["lerobot"]["chunk"])
+    if "feeding" in row:
+        fed = row["feeding"]
+        print(f"{model}: from {fed['workers']} reading processes {fed['samples_per_s']:.1f} samples/s, "
+              f"{fed['waiting']:.0%} of the time waiting for data")  # fmt: skip
+    for way, took in row.get("chunk", {}).items():
+        apart = f", differs by {took['difference']:.1e}" if "difference" in took else ""
+        print(f"{model}: chunk, {way}: p50 {took['p50_ms']:.1f} ms, p99 {took['p99_ms']:.1f}{apart}", flush=True)
+
+
+def show_attention(result: dict[str, Any]) -> None:
+    """Print what attention alone takes, and where it fails."""
     for backend, row in result["attention"].items():
-        text = row if isinstance(row, str) else f"{row['ms']:.2f} ms forward and backward, error {row['error']:.1e}"
+        text = row
+        if not isinstance(row, str):
+            errors = f"error {row['error']:.1e}, of gradients {row['gradient_error']:.1e}"
+            text = f"{row['ms']:.2f} ms forward and backward, {errors}"
         print(f"attention, {backend}: {text}")
-    print("NaN sweep:", ", ".join(result["nan"]) or "none")
+    print("NaN sweep:", ", ".join(result["nan"]) or "none", flush=True)
 
 
 def _of_update(who: str, update: dict[str, Any]) -> str:
@@ -175,33 +188,37 @@ def _of_update(who: str, update: dict[str, Any]) -> str:
     return f"{who}: update {update['ms']:.1f} ms, {update['samples_per_s']:.1f} samples/s, MFU {mfu}, peak {gib}"
 
 
-def _show_chunks(ways: dict[str, dict[str, float]]) -> None:
-    for way, took in ways.items():
-        apart = f", differs by {took['difference']:.1e}" if "difference" in took else ""
-        print(f"  chunk, {way}: p50 {took['p50_ms']:.1f} ms, p99 {took['p99_ms']:.1f}{apart}")
-
-
-def alone(models: Sequence[str], setup: Setup, workers: int, lerobot: bool) -> dict[str, Any]:
-    """Everything that one process measures."""
-    result: dict[str, Any] = {"machine": machine(), "device": setup.device.type, "models": {}}
-    result["cudnn"] = torch.backends.cudnn.version()
+def alone(
+    result: dict[str, Any], models: Sequence[str], parts: Sequence[str], setup: Setup, workers: int
+) -> Iterator[None]:
+    """Add to `result` what one process measures, one row at a time."""
+    result |= {"machine": machine(), "device": setup.device.type, "cudnn": torch.backends.cudnn.version()}
+    rows: dict[str, dict[str, Any]] = result.setdefault("models", {})
+    print(f"{result['machine']}; cuDNN {result['cudnn']}", flush=True)
+    measures: dict[str, Callable[[str], dict[str, Any]]] = {
+        "training": lambda model: training(model, setup),
+        "feeding": lambda model: feeding(model, setup, workers),
+        "chunk": lambda model: chunks(model, setup),
+    }
     for model in models:
-        row = result["models"][model] = {"training": training(model, setup)}
-        gc.collect()
-        row["feeding"] = feeding(model, setup, workers)
-        gc.collect()
-        row["chunk"] = chunks(model, setup)
-        gc.collect()
-    result["lerobot"] = NOT_MEASURED
-    if lerobot and find_spec("lerobot") and find_spec("transformers"):
+        for part in (part for part in measures if part in parts):
+            rows.setdefault(model, {})[part] = measures[part](model)
+            gc.collect()
+            show_model(model, {part: rows[model][part]})
+            yield
+    if "lerobot" in parts and find_spec("lerobot") and find_spec("transformers"):
         from gpu_lerobot import lerobot_row
 
         result["lerobot"] = lerobot_row(setup)
         gc.collect()
-    small = setup.device.type != "cuda"
-    result["attention"] = attention_rows(setup, (32, 32, 8, 4), 32) if small else attention_rows(setup)
-    result["nan"] = nan_sweep(setup, range(8, 24, 8) if small else range(256, 640, 4), 32 if small else 256)
-    return result
+        show_model("LeRobot's PI05", result["lerobot"])
+        yield
+    if "attention" in parts:
+        small = setup.device.type != "cuda"
+        result["attention"] = attention_rows(setup, (32, 32, 8, 4), 32) if small else attention_rows(setup)
+        result["nan"] = nan_sweep(setup, range(8, 24, 8) if small else range(256, 640, 4), 32 if small else 256)
+        show_attention(result)
+        yield
 
 
 def together(models: Sequence[str], setup: Setup) -> dict[str, Any]:
@@ -212,6 +229,12 @@ def together(models: Sequence[str], setup: Setup) -> dict[str, Any]:
             rows[f"{model}, {strategy}"] = training(model, setup, strategy)
             gc.collect()
     return rows
+
+
+def write(output: Path | None, result: dict[str, Any]) -> None:
+    """Keep what was measured so far."""
+    if output is not None:
+        output.write_text(json.dumps(result, indent=2) + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -225,8 +248,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--attention", default="auto", help="backend in training: auto, sdpa, flex or varlen")
     parser.add_argument("--eager", action="store_true", help="compile no layers")
-    parser.add_argument("--no-lerobot", action="store_true", help="leave LeRobot's PI05 out")
-    parser.add_argument("--output", type=Path, help="a JSON file; one that is there is gone on with")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what is measured")
+    parser.add_argument("--output", type=Path, help="a JSON file, written after each row; rows that it has are kept")
     args = parser.parse_args(arguments)
     device, rank, processes = join_processes(args.device)
     setup = Setup(args.backbone, args.batch, args.rounds, device, not args.eager, args.attention, processes)
@@ -235,8 +258,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = json.loads(args.output.read_text())
     failures = []
     if processes == 1:
-        result |= alone(args.models, setup, args.workers, not args.no_lerobot)
-        show(result)
+        for _ in alone(result, args.models, args.parts, setup, args.workers):
+            write(args.output, result)
         failures = judge(result)
     else:
         rows = together(args.models, setup)
@@ -245,9 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if rank == 0:
             for who, row in rows.items():
                 print(_of_update(f"{who}, {processes} processes", row), flush=True)
+            write(args.output, result)
         distributed.destroy_process_group()
-    if args.output is not None and rank == 0:
-        args.output.write_text(json.dumps(result, indent=2) + "\n")
     for failure in failures if rank == 0 else ():
         print("BELOW THE GOAL:", failure)
     return int(bool(failures))

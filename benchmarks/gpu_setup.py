@@ -106,7 +106,8 @@ def sample_flops(model: str, backbone: str) -> tuple[int, int]:
 
 def built(model: str, backbone: str, device: torch.device, attention: str = "auto") -> MMEPolicy:
     """A policy as it is trained, its tower frozen."""
-    options: dict[str, Any] = {"policy.augment": False}
+    # PaliGemma's tokenizer is gated, and no text is measured.
+    options: dict[str, Any] = {"policy.augment": False, "processor.tokenizer": "sample"}
     if device.type == "cuda":
         options["policy.compute_dtype"] = "bfloat16"
     policy = build_policy(model, backbone=backbone, device=device, **options)

@@ -1,5 +1,7 @@
 """Every backend of attention computes what the additive mask does, for every table of who may see whom."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -7,6 +9,7 @@ from torch import Tensor
 from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
 from mme_vla.backbone.layers import MaskLayout, Visibility, attend, build_mask, select_rows
+from mme_vla.speed import sparse_attention
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 
 OTHERS = ["flex", "varlen"]
@@ -40,6 +43,23 @@ def test_answers_and_gradients_are_those_of_the_mask(backend: str, table: Visibi
 
     for actual, expected in zip(computed(backend), computed("sdpa"), strict=True):
         assert torch.allclose(actual, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_keys_of_no_sample_get_no_gradient_whatever_the_kernel_leaves_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    def kernel(*arguments: Any) -> Tensor:
+        """Flash attention writes no gradient for rows past the last start: NaN here, any number on a GPU."""
+        for x in arguments[1:3]:
+            unseen = torch.arange(len(x)) >= arguments[4][-1]
+            x.register_hook(lambda gradient, unseen=unseen: gradient.masked_fill(unseen[:, None, None], torch.nan))
+        return one_by_one(*arguments)
+
+    one_by_one = sparse_attention._one_by_one
+    monkeypatch.setattr(sparse_attention, "_one_by_one", kernel)
+    layout, tensors = inputs(TABLES["memory"], 1)
+    leaves = [x.requires_grad_() for x in tensors]
+    attend(*leaves, build_mask(layout, torch.float32, "varlen", compiled=False)).sum().backward()
+    assert not layout.visible.all()
+    assert all(torch.isfinite(x.grad).all() for x in leaves if x.grad is not None)
 
 
 @pytest.mark.parametrize("backend", OTHERS)

@@ -1,4 +1,7 @@
-"""Whole policies equal the released implementation: velocity, loss and sampled actions at tiny size."""
+"""Whole policies equal the released implementation: velocity, loss and sampled actions at tiny size.
+
+They run on the GPU where there is one.
+"""
 
 from pathlib import Path
 
@@ -14,6 +17,7 @@ MODELS = ["pi05_baseline", "symbolic-grounded-subgoal"] + [
     for integration in ("context", "modul", "expert")
 ]
 TOLERANCE = 1e-4
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 ROUNDED_TOLERANCE = 2e-2  # where bfloat16 is rounded on the way, a last bit may fall either way
 
 
@@ -22,8 +26,13 @@ def case(request: pytest.FixtureRequest, parity: Path):
     name = f"model_{request.param}"
     if not (parity / f"{name}.safetensors").is_file():
         pytest.skip(f"{name} is not in {parity}")
+    return loaded(parity, name)
+
+
+def loaded(parity: Path, name: str):
     tensors, about = golden.load(parity, name)
-    return golden.policy(tensors, about), tensors, about
+    policy = golden.policy(tensors, about).to(DEVICE)
+    return policy, {key: value.to(DEVICE) for key, value in tensors.items()}, about
 
 
 def exact(policy, tensors):
@@ -67,14 +76,29 @@ def test_rmt_rounds_where_the_released_model_does(integration, parity):
     name = f"model_recurrent-rmt-{integration}"
     if not (parity / f"{name}.safetensors").is_file():
         pytest.skip(f"{name} is not in {parity}")
-    tensors, about = golden.load(parity, name)
-    policy = golden.policy(tensors, about)
+    policy, tensors, about = loaded(parity, name)
     batch, memory = golden.batch(tensors), golden.memory_tokens(policy, tensors)
     assert golden.error(memory.tokens, tensors["out/mem_tokens"]) <= ROUNDED_TOLERANCE
     velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
     assert golden.error(velocity, tensors["out/v_t"]) <= ROUNDED_TOLERANCE
     sampled = policy.sample_actions(batch, tensors["in/sample_noise"], about["num_denoise_steps"], memory=memory)
     assert golden.error(sampled, tensors["out/sampled_actions"]) <= ROUNDED_TOLERANCE
+
+
+@torch.no_grad()
+def test_bfloat16_stays_near_the_released_model(case):
+    """Under autocast, as in training, and with rounded weights, as in evaluation; relative to the largest entry."""
+    policy, tensors, about = case
+    policy.compute_dtype = torch.bfloat16
+    for dtype in (torch.float32, torch.bfloat16):
+        policy.to(dtype)
+        with policy.autocast():
+            batch, memory = golden.batch(tensors), golden.memory_tokens(policy, tensors)
+            velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
+            noise = tensors["in/sample_noise"]
+            sampled = policy.sample_actions(batch, noise, about["num_denoise_steps"], memory=memory)
+        for actual, expected in ((velocity, tensors["out/v_t"]), (sampled, tensors["out/sampled_actions"])):
+            assert golden.error(actual, expected) <= ROUNDED_TOLERANCE * float(expected.abs().max()), dtype
 
 
 def test_gradients_equal_the_released_model(case):
