@@ -183,7 +183,7 @@ def show_attention(result: dict[str, Any]) -> None:
 
 
 def _of_update(who: str, update: dict[str, Any]) -> str:
-    mfu = NOT_MEASURED if update["mfu"] is None else f"{update['mfu']:.1%} (HFU {update['hfu']:.1%})"
+    mfu = NOT_MEASURED if update.get("mfu") is None else f"{update['mfu']:.1%} (HFU {update['hfu']:.1%})"
     gib = NOT_MEASURED if update["peak_gib"] is None else f"{update['peak_gib']:.1f} GiB"
     return f"{who}: update {update['ms']:.1f} ms, {update['samples_per_s']:.1f} samples/s, MFU {mfu}, peak {gib}"
 
