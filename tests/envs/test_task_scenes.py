@@ -42,7 +42,7 @@ def leaves(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def same(found: Any, recorded: Any) -> bool:
-    return abs(found - recorded) <= 1e-6 if isinstance(recorded, int | float) else found == recorded
+    return abs(found - recorded) <= 1e-5 if isinstance(recorded, int | float) else found == recorded
 
 
 def test_every_task_is_in_the_file() -> None:
