@@ -5,19 +5,23 @@ import math
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 import torch
 from omegaconf import OmegaConf
 
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.config.composition import compose, config_dir
+from mme_vla.data.lerobot_files import check_vectors
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
+from mme_vla.policy.saving import composition_digest
 from mme_vla.processing.processor import Processor
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 from mme_vla.utils import SUMS
 
 SHIPPED = sorted(path.stem for path in (config_dir() / "embodiment").glob("*.yaml"))
+SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 TINY = {"vision": {**SMALL_VISION, "patch_size": 16}}
 
 
@@ -47,6 +51,8 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
     assert Embodiment.from_dict(json.loads(json.dumps(robot.to_dict()))) == robot
     policy = build_policy("pi05", device="meta", embodiment=name)
     assert policy.embodiment == robot and policy.backbone.config.horizon == robot.action.horizon
+    if name.startswith("robomme"):
+        check_benchmark(robot, SPACES)
 
 
 @pytest.mark.parametrize(
@@ -60,6 +66,9 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
         (section(state={"key": "state"}), "lacks the key 'width'"),
         (section(fsp=20), "Did you mean 'fps'"),
         (section(fps=0), "fps must be a positive number"),
+        (section(fps=math.inf), "positive number to 1000"),
+        (section(state={"width": 10**9}), "positive whole number to 65536"),
+        (section(cameras="x" * 10**6), "at least one camera"),
         (action(width=0), "action.width must be a positive"),
         (action(relative=[8]), "relative must list numbers from 0 to 7"),
         (action(relative=[1, 1]), "twice"),
@@ -71,9 +80,10 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
         (action(frames=2), "expected 1; null if"),
     ],
 )
-def test_impossible_robots_are_refused_by_the_key(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UserError, match=message):
+def test_impossible_robots_are_refused_by_the_key_in_few_words(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
         Embodiment.from_dict(options)
+    assert len(str(caught.value)) < 300
 
 
 def test_a_robot_and_a_network_that_do_not_fit_are_refused() -> None:
@@ -83,11 +93,27 @@ def test_a_robot_and_a_network_that_do_not_fit_are_refused() -> None:
         build_policy("pi05", device="meta", backbone={"horizon": 5})
 
 
-def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_path: Path) -> None:
+def saved(folder: Path) -> MMEPolicy:
+    """A policy of the default robot; its files may be changed."""
     policy = build_policy("pi05", backbone=TINY)
     policy.require_processor().stats = unit_stats()
-    policy.save_pretrained(tmp_path)
-    (tmp_path / SUMS).unlink()
+    policy.save_pretrained(folder)
+    (folder / SUMS).unlink()
+    return policy
+
+
+def test_a_processor_of_another_robot_than_the_configurations_is_refused(tmp_path: Path) -> None:
+    saved(tmp_path)
+    file = tmp_path / "processor.json"
+    settings = json.loads(file.read_text())
+    settings["embodiment"]["action"]["relative"] = []
+    file.write_text(json.dumps(settings))
+    with pytest.raises(UserError, match="they describe it differently"):
+        MMEPolicy.from_pretrained(tmp_path)
+
+
+def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_path: Path) -> None:
+    policy = saved(tmp_path)
     file = tmp_path / "config.json"
     config = json.loads(file.read_text())
     assert config.pop("embodiment")["name"] == "robomme_joint"
@@ -107,6 +133,13 @@ def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:
     policy.save_pretrained(tmp_path)
     assert MMEPolicy.from_pretrained(tmp_path).embodiment == shipped("robomme_waypoint")
     assert Processor.load(tmp_path).embodiment.action.horizon == 4
+
+
+def test_the_robot_tells_compositions_apart_and_the_panda_goes_without_saying() -> None:
+    config: dict[str, Any] = {"memory": None, "backbone": {"horizon": 20}}
+    digest = composition_digest(config)
+    assert composition_digest({**config, "embodiment": section()}) == digest
+    assert composition_digest({**config, "embodiment": action(relative=[])}) != digest
 
 
 def test_statistics_of_another_robot_are_refused() -> None:
@@ -133,11 +166,19 @@ def test_angles_do_not_jump_and_the_gripper_of_a_waypoint_is_exactly_open_or_clo
     assert space.to_absolute(noisy[None], torch.zeros(1, 8))[0, :, 6].tolist() == [-1.0, 1.0]
 
 
-def test_only_robots_of_the_benchmark_can_be_evaluated_on_it() -> None:
-    spaces = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
-    for name in [name for name in SHIPPED if name.startswith("robomme")]:
-        check_benchmark(shipped(name), spaces)
+def test_robots_that_the_benchmark_does_not_have_are_not_evaluated_on_it() -> None:
     with pytest.raises(UserError, match="its action space is None"):
-        check_benchmark(shipped("real_panda"), spaces)
+        check_benchmark(shipped("real_panda"), SPACES)
     with pytest.raises(UserError, match="has the cameras side"):
-        check_benchmark(Embodiment.from_dict(section(cameras={"front": {}, "side": {}})), spaces)
+        check_benchmark(Embodiment.from_dict(section(cameras={"front": {}, "side": {}})), SPACES)
+
+
+def test_a_single_number_may_stand_without_a_list_and_is_checked_all_the_same(tmp_path: Path) -> None:
+    class Table:
+        def __init__(self, *values: float | None) -> None:
+            self.data = {"gripper": pa.chunked_array([pa.array(values, pa.float32())])}
+
+    check_vectors(tmp_path, Table(0.5, 1.0), "gripper", 1)
+    for wrong in (None, math.nan, math.inf):
+        with pytest.raises(UserError, match="row 1 has gripper"):
+            check_vectors(tmp_path, Table(0.5, wrong), "gripper", 1)

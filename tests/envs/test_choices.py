@@ -11,10 +11,9 @@ import pytest
 import torch
 
 from helpers.h5_files import OPTIONS, choice_at, robomme_robot, write_file
-from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError
-from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
@@ -28,18 +27,8 @@ from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 
 EIGHT = [{"label": letter, "action": "move", "need_parameter": False} for letter in "abcdefgh"]
-
-
 CHOOSER = robomme_robot("robomme_choice")
 SPACE = CHOOSER.action
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("choices")
-    write_file(place / "record_dataset_Alpha.h5", [24, 30], videos=[8, 0], choices=True)
-    convert(list_episodes(find_files([place])), place / "out", ConvertOptions(images="png"))
-    return place / "out"
 
 
 # Numbers ------------------------------------------------------------------------------------------------------------
@@ -118,7 +107,7 @@ def test_recorded_choices_are_converted_and_read_as_decisions(folder: Path) -> N
     source = EpisodeSource(folder, robot=CHOOSER)
     assert [option.to_dict() for option in source.options(0)] == OPTIONS
     # Chosen at every fourth frame, but at 12 nothing; the execution of episode 0 begins at frame 8.
-    assert source.decisions(0).tolist() == [8, 15, 19] and source.decisions(1).tolist() == [0, 3, 7, 15, 19, 23]
+    assert source.decisions(0).tolist() == [8, 15, 19] and source.decisions(1).tolist() == [0, 3, 7, 15]
     chunk, recorded = source.action_chunk(0, 15, 4)
     assert recorded.tolist() == [True, True, False, False]
     expected = [choice_at(number) for number in (4, 5, 5, 5)]
@@ -132,7 +121,7 @@ def test_letters_that_are_seldom_selected_stay_numbers_of_ordinary_size(folder: 
         assert low[:8].tolist() == [0] * 8 and high[:8].tolist() == [1] * 8
     processor = Processor(28, Tokenizer.load("sample"), stats=stats, embodiment=CHOOSER)
     data = TrainingDataset([source], processor)
-    assert len(data) == 9
+    assert len(data) == 7
     item = data[0]
     assert item["actions"].abs().max() < 2, "letters are −1 and 1; the point is about as large"
     back = SPACE.decide(processor.absolute_actions(item["actions"], item["state"]), source.options(0))
@@ -234,7 +223,7 @@ class Offering(ChoiceEnvs):
 def test_a_rollout_asks_after_each_choice_and_takes_what_is_offered_only() -> None:
     policy = quick_policy("framesamp_modul", patch_size=8, embodiment="robomme_choice", memory={"budget": 64})
     envs = Offering(robot=CHOOSER)
-    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=FACTS.max_steps)
+    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=9)
     assert record.outcome in ("success", "timeout") and record.action_space == "multi_choice"
     assert record.extra["chunks"] == len(envs.taken) == record.steps // 3
     assert {action["choice"] for action in envs.taken} <= {"A", "B"}

@@ -11,16 +11,12 @@ import sapien
 from scipy.spatial.transform import Rotation
 
 from helpers.env_scenes import Scene
-from mme_vla.envs.recording.recorder import demonstrate
 from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError, arc
 from mme_vla.envs.robot.gripper_skills import failing_offset, grasp_orientation
 from mme_vla.envs.scene.articulated import PEG_COLOUR, build_button, build_peg
 from mme_vla.envs.scene.objects import build_aperture_box, build_board, build_container, build_cube, build_disc
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.task import Task
-from mme_vla.envs.tasks.pattern_lock import PatternLock
-
-PHYSICS = {"obs_mode": "none", "render_backend": "none"}
 
 
 class Log:
@@ -59,18 +55,6 @@ def things(env: Scene) -> dict:
 def pick_and_place(env: Scene) -> None:
     env.add(build_cube(env, "cube", "red", (-0.1, 0.1), 0.3))
     env.add(build_disc(env, "target", 0.04, 0.005, "purple", (0.0, -0.1)))
-
-
-def test_the_same_scene_is_demonstrated_the_same_way() -> None:
-    actions = []
-    for _ in range(2):
-        env = PatternLock(seed=15800, difficulty="easy", obs_mode="none", render_backend="none")
-        env.reset()
-        log = Log(env)
-        assert demonstrate(env, log.demonstrator)
-        actions.append(log.actions)
-        env.close()
-    np.testing.assert_array_equal(*actions)
 
 
 def test_a_cube_is_picked_up_and_placed() -> None:
@@ -227,8 +211,10 @@ def test_a_cube_is_hooked_to_a_goal_with_a_peg(cube: tuple[float, float], goal: 
     assert log.grips == [1, -1, -1, -1, -1, 1]
 
 
-@pytest.mark.parametrize("motion", ["insert_peg", "insert_peg_fully"])
-@pytest.mark.parametrize(("grasped", "side"), [("tail", 1), ("head", 1), ("head", -1)])
+@pytest.mark.parametrize(
+    ("grasped", "side", "motion"),
+    [("tail", 1, "insert_peg"), ("head", 1, "insert_peg"), ("head", -1, "insert_peg"), ("head", 1, "insert_peg_fully")],
+)
 def test_a_peg_is_inserted_from_the_side_that_was_requested(grasped: str, side: int, motion: str) -> None:
     def fill(env: Scene) -> None:
         env.add(build_aperture_box(env, (0.0, 0.0), np.pi / 2))

@@ -146,20 +146,6 @@ def test_a_closed_or_unstarted_environment_says_so(make_unrendered) -> None:
             use()
 
 
-def test_resets_and_environments_repeat_bit_for_bit(make_unrendered) -> None:
-    def run(env: Any) -> list[np.ndarray]:
-        env.reset()
-        rng = np.random.default_rng(0)
-        for _ in range(40):
-            env.step(STILL + np.append(rng.normal(0, 0.3, 7), 0))
-        return [env.task.get_state().numpy().copy()]
-
-    env = make_unrendered("VideoUnmask", "train", 4)
-    first, second, other = run(env), run(env), run(make_unrendered("VideoUnmask", "train", 4))
-    np.testing.assert_array_equal(first, second)
-    np.testing.assert_array_equal(first, other)
-
-
 # Making -----------------------------------------------------------------------------------------------------------
 
 

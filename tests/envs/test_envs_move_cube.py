@@ -6,11 +6,10 @@ import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_tasks import go_to, make, read_cube, read_disc, steps_of_demonstration, wait
+from helpers.env_tasks import go_to, steps_of_demonstration, wait
 from mme_vla.envs.scene.objects import H
-from mme_vla.envs.scene.placement import Draws, Region
-from mme_vla.envs.scene.things import Thing, distance_xy
-from mme_vla.envs.tasks.move_cube import MANNERS, MoveCube
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.tasks.move_cube import MoveCube
 
 HOOK, PUSH, GRASP = 5, 3, 0  # seeds
 PICK_PEG, HOOK_CUBE = "Pick up the peg", "Hook the cube to the target with the peg"
@@ -36,46 +35,22 @@ def lift(env: MoveCube, in_hand: list[Thing], thing: Thing, parts: list[Thing]) 
     return wait(env)
 
 
-def read_peg(stream: Draws) -> tuple[float, float, float]:
-    side = -0.2 if stream.uniform() < 0.5 else 0.2
-    x, y = ((stream.uniform() - 0.5) * 0.1 for _ in range(2))
-    return x, side + y, np.radians(stream.uniform() * 90 - 45)
+def yaw_of(thing: Thing) -> float:
+    return 2 * np.arctan2(thing.pose.q[3], thing.pose.q[0])
 
 
-def peg_of(pose: sapien.Pose) -> tuple[float, float, float]:
-    return pose.p[0], pose.p[1], 2 * np.arctan2(pose.q[3], pose.q[0])
-
-
-def skip_centre(stream: Draws, goal: np.ndarray) -> Region:
-    while True:
-        centre = ((stream.uniform() - 0.5) * 0.2, (stream.uniform() - 0.5) * 0.2)
-        if np.hypot(centre[0] - goal[0], centre[1] - goal[1]) > 0.1:
-            return Region(centre, 0.05)
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5])
-@pytest.mark.parametrize("difficulty", ["easy", "hard"])
-def test_video_and_execution_come_from_the_stream_in_order(seed, difficulty):
-    env, stream = make(MoveCube, seed, difficulty), Draws(seed)
-    stream.uniform(), stream.uniform()
-    pegs = [read_peg(stream) for _ in range(2)]
-    stream.integer(0, 2), stream.integer(0, 2)
-    poses = (env.peg.initial_pose, env.target.initial_pose, env.cube.initial_pose)
+@pytest.mark.parametrize("seed", [HOOK, PUSH, GRASP])
+def test_on_the_way_back_from_the_video_everything_goes_to_its_place_in_the_execution(build_task, seed):
+    env = build_task(MoveCube, seed, "easy")
+    layout = env.scene_values()["spec"]["layout"]["execution"]
     env.reset_in_progress = True
     wait(env)
     env.reset_in_progress = False
-    assert peg_of(poses[0]) == pytest.approx(pegs[0], abs=1e-5)
-    assert peg_of(env.peg.pose) == pytest.approx(pegs[1], abs=1e-5)
-    read_disc(stream, Region((0, 0), 0.15), env.target)
-    env.target.set_home(env.target.pose)
-    read_disc(stream, Region((0, 0), 0.1), env.target)
-    read_cube(stream, skip_centre(stream, poses[1].p), env.cube)
-    assert distance_xy(poses[2].p, poses[1].p) > 0.1 - 0.03 * np.sqrt(2)
-    env.cube.set_home(env.cube.pose)
-    read_cube(stream, skip_centre(stream, env.target.position), env.cube)
-    stream.integer(0, 3)  # the first initialisation's
-    assert env.manner == MANNERS[stream.integer(0, 3)]
-    env.close()
+    assert env.target.position[:2] == pytest.approx(layout["goal_xy"], abs=1e-6)
+    assert env.peg.position[:2] == pytest.approx(layout["peg_offsets"][1:], abs=1e-5)
+    assert env.cube.position[:2] == pytest.approx(layout["cube_pose"][:2], abs=1e-6)
+    for thing, yaw in ((env.peg, layout["peg_yaw"]), (env.cube, layout["cube_pose"][2])):
+        assert np.cos(yaw - yaw_of(thing)) == pytest.approx(1, abs=1e-6)
 
 
 def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(build_task, monkeypatch):

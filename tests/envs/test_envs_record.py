@@ -1,4 +1,4 @@
-"""Recording and showing: rendered episodes of every suite, datasets that can be read, runs that resume."""
+"""Recording and showing: rendered episodes, datasets that can be read, runs that resume."""
 
 import json
 from collections.abc import Iterator
@@ -21,7 +21,6 @@ from mme_vla.errors import UserError
 from mme_vla.utils.media import GAP, MARGIN, TILE
 
 SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3)  # a single move
-ONE_OF_EACH_SUITE = {"StopCube": "easy", "VideoUnmask": "easy", "PickHighlight": "easy", "RouteStick": "easy"}
 
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -99,9 +98,9 @@ def test_what_cannot_be_recorded_is_refused_by_name(words: list[str], message: s
         record.plan(compose("record", [*words, "output=somewhere"]))
 
 
-@pytest.mark.parametrize(("task", "difficulty"), ONE_OF_EACH_SUITE.items())
-def test_an_episode_of_each_suite_is_rendered_to_its_success(task: str, difficulty: str) -> None:
-    env = make_task(task, render=True, seed=3, difficulty=difficulty)
+@pytest.mark.parametrize("task", ["VideoUnmask", "PickHighlight"])
+def test_an_episode_with_and_without_a_video_is_rendered_to_its_success(task: str) -> None:
+    env = make_task(task, render=True, seed=3, difficulty="easy")
     snapshots, success = show.demonstrate_with_images(env, every=40)
     env.close()
     assert success

@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_tasks import make, wait
+from helpers.env_tasks import built, wait
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks, make_env
-from mme_vla.envs.metadata import DIALS, TASK_NAMES, read_variant
+from mme_vla.envs.metadata import DIALS, TASK_NAMES
 from mme_vla.envs.subtasks import number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.errors import UserError
@@ -25,12 +25,6 @@ def scene(env: Task) -> dict[str, np.ndarray]:
     places = {thing.name: np.concatenate([thing.pose.p, thing.pose.q]) for thing in env.things}
     texts = [subtask.text for subtask in env.progress.subtasks] + env.goals()
     return {**places, "texts": np.array(texts)}
-
-
-def built(task: str, episode: int = 1, **settings: Any) -> Any:
-    load_tasks(task)
-    spec = metadata.episode(task, "test", episode)
-    return make(TASKS[task], spec.seed, spec.difficulty, **settings)
 
 
 @pytest.mark.parametrize(("dial", "task"), PAIRS)
@@ -100,6 +94,8 @@ def test_variants_that_there_are_not_are_reported(task: str, split: str, words: 
     with pytest.raises(UserError) as caught:
         metadata.episodes(task, split)
     assert words in str(caught.value)
+
+
+def test_a_task_refuses_a_dial_that_it_does_not_have() -> None:
     with pytest.raises(UserError, match="cannot turn 'swaps'"):
         built("PickXtimes", stress={"swaps": 1})
-    assert read_variant("test") is None

@@ -82,11 +82,12 @@ def test_a_long_video_arrives_completely_and_in_order(envs: VecEnv) -> None:
     assert [int(frame[0, 0, 0]) for frame in frames] == [7 + k for k in range(21)], "earlier frames were overwritten"
 
 
-def test_whoever_is_ready_comes_first(envs: VecEnv) -> None:
-    envs.send(0, 4.0)
-    envs.send(1, 0.0)
+def test_whoever_is_ready_comes_first(envs: VecEnv, tmp_path: Path) -> None:
+    envs.send(0, tmp_path / "released")  # the step waits for this file
+    envs.send(1, "go")
     assert only(envs.recv()).worker == 1
     assert envs.recv(timeout=0.05) == []
+    (tmp_path / "released").touch()
     assert only(envs.recv()).worker == 0
 
 

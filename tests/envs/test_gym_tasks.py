@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from helpers import REPOSITORY
-from mme_vla.envs.metadata import TASK_NAMES
 
 pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
 import gymnasium
@@ -15,13 +14,9 @@ from gymnasium.utils.env_checker import check_env
 
 import mme_vla.envs.gym  # noqa: F401
 
-QUICK = ("StopCube", "PatternLock")
 
-
-@pytest.mark.parametrize(
-    "task", [pytest.param(task, marks=[] if task in QUICK else pytest.mark.slow) for task in TASK_NAMES]
-)
-def test_every_task_passes_gymnasiums_check(task: str) -> None:
+@pytest.mark.parametrize("task", ["StopCube", "PatternLock"])
+def test_tasks_of_gripper_and_stick_pass_gymnasiums_check(task: str) -> None:
     env = gymnasium.make(f"mme_vla/{task}-v0", images=False, max_steps=50)
     try:
         assert np.isfinite(env.action_space.low).all() and np.isfinite(env.action_space.high).all()

@@ -14,7 +14,6 @@ from helpers.scripted_env import ScriptedEnv
 from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.vector.pool import Job
 from mme_vla.policy.base import Policy
@@ -108,9 +107,3 @@ def test_a_client_must_say_that_it_adds_the_pose() -> None:
         ):
             with served.client() as client, pytest.raises(UserError, match=reason):
                 client.infer(state)
-
-
-def test_statistics_are_of_the_differences(folder: Path) -> None:
-    panda = robomme_robot(NAME)
-    stats = compute_norm_stats([EpisodeSource(folder, robot=panda)], horizon=1, robot=panda, every=True, extremes=True)
-    assert np.abs(stats.actions.max[:6]).max() < 0.2

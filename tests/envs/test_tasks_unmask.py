@@ -1,7 +1,6 @@
-"""The four Unmask tasks: layouts, covering, swaps, buttons, success and failure, and official episodes replayed."""
+"""The four Unmask tasks: covering, swaps, buttons, success and failure, and official episodes replayed."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,8 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_scenes import replay, setup
-from helpers.env_tasks import lift, make, names, push_down, released, skip_place, under, wait, yaw_of
+from helpers.env_tasks import lift, make, push_down, released, under, wait
 from mme_vla.envs.scene.motions import COVER_STEPS
-from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Draws, Region, button_box
 from mme_vla.envs.scene.things import Thing, distance_xy
 from mme_vla.envs.tasks.button_unmask import ButtonUnmask
 from mme_vla.envs.tasks.button_unmask_swap import ButtonUnmaskSwap
@@ -22,10 +20,6 @@ from mme_vla.envs.tasks.video_unmask_swap import VideoUnmaskSwap
 
 SEEDS = {VideoUnmask: 6300, ButtonUnmask: 8300, VideoUnmaskSwap: 5300, ButtonUnmaskSwap: 7300}
 STILL, SWAPPING = (VideoUnmask, ButtonUnmask), (VideoUnmaskSwap, ButtonUnmaskSwap)
-TRIANGLE = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]
-LINE = [(0.0, -0.15), (0.0, 0.15), (0.0, 0.0)]
-SQUARE = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.1), (0.1, -0.1)]
-RANGES = {"easy": (3, (1, 2), (1, 2)), "medium": (4, (1, 2), (1, 1)), "hard": (4, (2, 3), (2, 2))}
 
 
 @pytest.fixture(params=SEEDS, ids=lambda task: task.__name__)
@@ -54,86 +48,6 @@ def go_to_picks(env) -> int:
         assert push_down(env, button) == (False, False)
     assert env.progress.current.pick
     return env.progress.index
-
-
-# Layouts ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", STILL)
-@pytest.mark.parametrize(
-    ("seed", "difficulty", "counts"),
-    [(1, "easy", {3}), (2, "easy", {3}), (3, "medium", {5}), (4, "medium", {5}), (5, "hard", {4, 5, 6}),
-     (6, "hard", {4, 5, 6}), (7, "hard", {4, 5, 6})],
-)  # fmt: skip
-def test_containers_stand_apart_where_the_stream_puts_them(build_task, task, seed, difficulty, counts):
-    env, stream = build_task(task, seed, difficulty), Draws(seed)
-    for button in buttons(env):
-        offset = (stream.uniforms(2).numpy() - 0.5) * 0.1
-        np.testing.assert_allclose(button.pose.p[:2], np.array([-0.2, 0]) + offset, atol=1e-6)
-    for container in env.containers:
-        assert skip_place(stream, Region((0, 0), 0.2), container) == pytest.approx(yaw_of(container), abs=1e-6)
-        for button in buttons(env):
-            assert button_box(button).distance(container.initial_pose.p[:2]) >= CONTAINER_HALF + 0.04 - 1e-6
-    if difficulty == "hard":  # one more found no place
-        for _ in range(TRIALS):
-            Region((0, 0), 0.2).place(stream, CONTAINER_HALF)
-    assert len(env.containers) in counts and env.colours == names(stream)
-    places = np.array([container.initial_pose.p[:2] for container in env.containers])
-    assert np.abs(places).max() <= 0.2 - CONTAINER_HALF
-    distances = np.linalg.norm(places[:, None] - places, axis=-1)[np.triu_indices(len(places), 1)]
-    assert distances.min() > 0.0675
-
-
-@pytest.mark.parametrize("difficulty", RANGES)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_video_swap_everything_comes_from_the_streams_in_order(build_task, seed, difficulty):
-    env = build_task(VideoUnmaskSwap, seed, difficulty, recovery="z")
-    count, swaps, picks = RANGES[difficulty]
-    stream = Draws(seed)
-    assert env.swap_count == stream.integer(swaps[0], swaps[1] + 1)
-    assert env.pick_count == stream.integer(picks[0], picks[1] + 1)
-    stream = Draws(seed)
-    on_line, angle = stream.integer(0, 2), 180 * stream.uniform()
-    cos, sin = math.cos(angle), math.sin(angle)
-    anchors = SQUARE if count == 4 else LINE if on_line else TRIANGLE
-    assert len(env.containers) == count
-    for (x, y), container in zip(anchors, env.containers, strict=True):
-        region = Region((cos * x - sin * y, sin * x + cos * y), 0.07)
-        assert skip_place(stream, region, container) == pytest.approx(yaw_of(container), abs=1e-6)
-    assert env.colours == names(stream)
-    assert env.over_cubes == [env.containers[i] for i in stream.permutation(3)]
-    stream.integer(0, 3)
-    first = stream.permutation(3)[:2]
-    remaining = [i for i in range(count) if i not in first]
-    initiators = [*first, remaining[stream.integer(0, len(remaining))]][: env.swap_count]
-    assert env.initiators == [env.containers[i] for i in initiators]
-    assert env.failed_pick == stream.integer(0, env.pick_count)
-
-
-@pytest.mark.parametrize("difficulty", RANGES)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_button_swap_everything_comes_from_the_stream_in_order(build_task, seed, difficulty):
-    env, stream = build_task(ButtonUnmaskSwap, seed, difficulty), Draws(seed)
-    for button, y in ((env.left, -0.1), (env.right, 0.1)):
-        offset = (stream.uniforms(2).numpy() - 0.5) * 0.05
-        np.testing.assert_allclose(button.pose.p[:2], np.array([-0.2, y]) + offset, atol=1e-6)
-    o = [0.1 * stream.uniform() for _ in range(8)]
-    on_line = stream.integer(0, 2)
-    anchors = [(0.0, -0.1 + o[0]), (0.0, 0.1 + o[0]), (0.1, 0.1 + o[1]), (0.1, -0.1 + o[1])]
-    if difficulty == "easy":
-        anchors = [(-0.05 + o[2], -0.15), (-0.05 + o[3], 0.15), (0.05 + o[4], 0.0)]
-        if on_line:
-            anchors = [(-0.05 + o[5], -0.15), (-0.05 + o[6], 0.15), (-0.05 + o[7], 0.0)]
-    for anchor, container in zip(anchors, env.containers, strict=True):
-        assert skip_place(stream, Region(anchor, 0.07), container) == pytest.approx(yaw_of(container), abs=1e-6)
-    assert env.colours == names(stream)
-
-
-@pytest.mark.parametrize("seed", [8303, 8304, 8305])
-def test_the_pick_that_recovery_fails_has_a_separate_stream(build_task, seed):
-    stream = Draws(seed)
-    stream.integer(1, 6)
-    assert build_task(ButtonUnmask, seed, "hard", recovery="z").failed_pick == stream.integer(0, 2)
 
 
 # Covering and swaps -------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import os
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,8 @@ class LightEnv:
             vector_worker.renderer_works = lambda: False
             raise RuntimeError("ErrorDeviceLost")
         self.steps += 1
-        if isinstance(action, float):
-            time.sleep(action)
+        while isinstance(action, Path) and not action.exists():
+            time.sleep(0.01)
         frame = np.full(FRAME, self.steps, np.uint8)
         return {"front_rgb_list": [frame]}, 0.0, action == "end", False, {"status": "ongoing", "steps": self.steps}
 

@@ -1,18 +1,21 @@
-"""Helpers of the tests of tasks: scenes, fakes of fingers and tool, and the stream of random numbers."""
+"""Helpers of the tests of tasks: scenes, and fakes of fingers and tool."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 import sapien
 
+from mme_vla.envs import metadata
+from mme_vla.envs.make import load_tasks
 from mme_vla.envs.recording.recorder import demonstrate
 from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.scene.articulated import Button
-from mme_vla.envs.scene.objects import Container, Cube, Disc, H
-from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Draws, Region
+from mme_vla.envs.scene.objects import H
 from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.task import Task
+from mme_vla.registry import TASKS
 
 Flags = tuple[bool, bool]
 """Success and failure after a step or an evaluation."""
@@ -24,6 +27,13 @@ def make(task: type[Task], seed: int, difficulty: str, **settings: object) -> Ta
     env = task(seed=seed, difficulty=difficulty, obs_mode="none", render_backend="none", **settings)
     env.reset()
     return env
+
+
+def built(task: str, episode: int = 1, **settings: Any) -> Any:
+    """The scene of an episode of the test split in physics alone, reset."""
+    load_tasks(task)
+    spec = metadata.episode(task, "test", episode)
+    return make(TASKS[task], spec.seed, spec.difficulty, **settings)
 
 
 def wait(env: Task, steps: int = 1) -> Flags:
@@ -56,29 +66,6 @@ def released(env: Task, button: Button) -> None:
     wait(env)
 
 
-def skip_place(draws: Draws, region: Region, container: Container) -> float:
-    """Read from a stream the trials that end with a container's place, and its turn.
-
-    Returns:
-        The turn in radians.
-    """
-    for _ in range(TRIALS):
-        if np.allclose(region.place(draws, CONTAINER_HALF), container.initial_pose.p[:2], atol=1e-6):
-            return float(np.deg2rad(90 * draws.uniform()))
-    raise AssertionError(f"{container.name} does not stand where one of {TRIALS} trials would put it")
-
-
-def yaw_of(thing: Thing) -> float:
-    """By how much an upside-down thing was turned about its own vertical, radians."""
-    _, x, y, _ = thing.initial_pose.q
-    return float(2 * np.arctan2(-y, x))
-
-
-def names(draws: Draws) -> list[str]:
-    """Read the shuffled colours of the cubes from a stream."""
-    return [("red", "green", "blue")[i] for i in draws.permutation(3)]
-
-
 def under(things: Sequence[Thing], containers: Sequence[Thing]) -> bool:
     """Whether each thing lies under the container of the same index."""
     pairs = zip(things, containers, strict=True)
@@ -106,38 +93,6 @@ class Hand:
         xy = thing.initial_pose.p[:2] if place is None else place[:2]
         thing.move_to(sapien.Pose([*xy, H], thing.initial_pose.q))
         return wait(self._env)
-
-
-def read_button(stream: Draws, button: Button, centre: tuple[float, float], widths: tuple[float, float]) -> None:
-    """Read a button's place from a stream and compare."""
-    offset = (stream.uniforms(2).numpy() - 0.5) * widths
-    np.testing.assert_allclose(button.pose.p[:2], np.array(centre) + offset, atol=1e-6)
-
-
-def read_cube(stream: Draws, region: Region, cube: Cube) -> None:
-    """Read from a stream the trials that end with a cube's place and turn."""
-    for _ in range(TRIALS):
-        xy, yaw = region.place(stream, H), 2 * np.pi * stream.uniform()
-        if np.allclose(xy, cube.initial_pose.p[:2], atol=1e-6):
-            w, _, _, z = cube.initial_pose.q
-            assert np.cos(yaw - 2 * np.arctan2(z, w)) == pytest.approx(1, abs=1e-6)
-            return
-    raise AssertionError(f"{cube.name} does not stand where one of {TRIALS} trials would put it")
-
-
-def read_disc(stream: Draws, region: Region, disc: Disc) -> None:
-    """Read from a stream the trials that end with a target's place."""
-    for _ in range(TRIALS):
-        if np.allclose(region.place(stream, disc.radius), disc.initial_pose.p[:2], atol=1e-6):
-            return
-    raise AssertionError(f"{disc.name} does not lie where one of {TRIALS} trials would put it")
-
-
-def least_distance(things: Sequence[Thing]) -> float:
-    """Between the centres of any two, metres."""
-    places = np.array([thing.initial_pose.p[:2] for thing in things])
-    distances = np.linalg.norm(places[:, None] - places, axis=-1)
-    return float(distances[np.triu_indices(len(things), 1)].min(initial=np.inf))
 
 
 def steps_of_demonstration(env: Task) -> int | None:
