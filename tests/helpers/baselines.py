@@ -1,8 +1,10 @@
 """Golden cases of the prior methods' original code: where they lie, and their weights by rule."""
 
+import json
 import os
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,17 @@ def baselines_folder(method: str) -> Path:
     if not folder.is_dir():
         pytest.skip(f"no golden cases of {method} at {folder} (set MME_VLA_PARITY_BASELINES)")
     return folder
+
+
+def arrays(folder: Path, name: str) -> dict[str, Tensor]:
+    """Arrays of one golden file."""
+    with np.load(folder / f"{name}.npz") as archive:
+        return {key: torch.from_numpy(archive[key]) for key in archive.files}
+
+
+def case(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Arrays and description of one golden file."""
+    return arrays(folder, name), json.loads((folder / f"{name}.json").read_text())
 
 
 def rule_uniform(name: str, shape: tuple[int, ...], seed: int) -> Tensor:

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
@@ -19,7 +20,9 @@ INTEGRATION = {"context": "context", "modulation": "modulator", "expert": "exper
 
 
 def load(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and description of one golden file."""
+    """Tensors and description of one golden file; skips the test where the folder lacks it."""
+    if not (folder / f"{name}.safetensors").is_file():
+        pytest.skip(f"{name} is not in {folder}")
     return load_file(folder / f"{name}.safetensors"), json.loads((folder / f"{name}.json").read_text())
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mme_vla.memory.base import MemoryModule, ScoringMemory
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
@@ -56,7 +56,9 @@ class LastFrames(MemoryModule, ScoringMemory):
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two items (dictionaries, structs, tensors, …) are equal to the last bit."""
+    """Whether two items (dictionaries, structs, tensors, weights of modules, …) are equal to the last bit."""
+    if isinstance(a, nn.Module):
+        return same(a.state_dict(), b.state_dict())
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
     if isinstance(a, HistoryTokens):

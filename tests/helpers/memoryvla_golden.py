@@ -1,10 +1,7 @@
-"""Golden cases of MemoryVLA: arrays, sizes, and its small network built here with its parameters."""
+"""Golden cases of MemoryVLA: its small network built here with its parameters."""
 
-import json
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,15 +17,6 @@ from mme_vla.weights.tables import read
 
 OPTIONS = {"consolidate_type": "consolidation", "fusion_type": "fusion", "update_fused": "store_fused"}
 RENAMED = OPTIONS | {"use_timestep_pe": "time_code", "retrieval_layers": "retrieval_layers"}
-
-
-def arrays(folder: Path, name: str) -> dict[str, Tensor]:
-    with np.load(folder / f"{name}.npz") as archive:
-        return {key: torch.from_numpy(archive[key]) for key in archive.files}
-
-
-def about(folder: Path) -> dict[str, Any]:
-    return json.loads((folder / "meta.json").read_text())  # type: ignore[no-any-return]
 
 
 def bank(

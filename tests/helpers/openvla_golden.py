@@ -1,10 +1,7 @@
 """Golden cases of OpenVLA-OFT: the original's small models, built here to their sizes with their parameters."""
 
-import json
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,13 +14,6 @@ from mme_vla.types import Batch, HistoryTokens
 
 WRAPPER = "base_model.model."  # peft's, before every name of the model it wraps
 END = 2
-
-
-def case(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Arrays and description of one golden file."""
-    with np.load(folder / f"{name}.npz") as arrays:
-        tensors = {key: torch.from_numpy(arrays[key]) for key in arrays.files}
-    return tensors, json.loads((folder / f"{name}.json").read_text())
 
 
 def parameters(golden: dict[str, Tensor], about: dict[str, Any]) -> dict[str, Tensor]:

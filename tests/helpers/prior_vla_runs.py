@@ -13,9 +13,11 @@ from mme_vla.training.logging import read_metrics
 
 TOWERS = [f"backbone.vision.{tower}.{size}" for tower in ("dino", "siglip") for size in (
     "width=8", "depth=2", "mlp_dim=16", "num_heads=1")]  # fmt: skip
+QUICK = ["logger=none", "train.workers=0", "train.device=cpu", "train.log_every=1", "train.open_loop_chunks=0"]
+UNTESTED = [*QUICK, "train.val_samples=0", "data.val_episodes=[]"]
+"""Without validation."""
 SHORT = [
-    *TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32", "logger=none",
-    "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=2", "train.open_loop_chunks=0",
+    *TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32", *QUICK, "train.val_samples=2",
     "train.ema=0.5",
 ]  # fmt: skip
 

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from helpers.baselines import baselines_folder
-from mme_vla.embodiment import Embodiment
+from helpers import baselines
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.processor import SimpleMemVlaProcessor
 from mme_vla.methods.simplememvla.video import Window
@@ -20,12 +18,11 @@ from mme_vla.weights.load import load_weights
 
 
 def folder() -> Path:
-    return baselines_folder("simplememvla")
+    return baselines.baselines_folder("simplememvla")
 
 
 def arrays(name: str) -> dict[str, Tensor]:
-    with np.load(folder() / f"{name}.npz") as archive:
-        return {key: torch.from_numpy(archive[key]) for key in archive.files}
+    return baselines.arrays(folder(), name)
 
 
 @cache
@@ -110,7 +107,3 @@ def golden_policy(target: Path, **processor: Any) -> SimpleMemVlaPolicy:
 def frames(prefix: str = "") -> dict[str, np.ndarray]:
     with np.load(folder() / "frames.npz") as archive:
         return {name: archive[prefix + name] for name in ("front", "wrist")}
-
-
-def robot() -> Embodiment:
-    return Embodiment.from_dict(robot_section(read("meta")["config"]))

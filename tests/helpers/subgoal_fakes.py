@@ -50,8 +50,9 @@ def predictor_of(*outcomes, **options):
     return Gemini(client=client, **{"backoff": 0, "requests_per_minute": None, **options}), client
 
 
-def frames(count, first=0):
-    return np.stack([np.full((32, 32, 3), (first + t) % 256, np.uint8) for t in range(count)])
+def frames(count, first=0, size=32):
+    """Images that show their number in every pixel."""
+    return np.stack([np.full((size, size, 3), (first + t) % 256, np.uint8) for t in range(count)])
 
 
 def started(predictor, task="StopCube", video=0):

@@ -7,7 +7,7 @@ import torch
 from mme_vla import UserError
 from mme_vla.memory.history import LazyHistory, OnlineHistory, StorageSpec
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import moving_frames, small_policy
+from mme_vla.testing.small import SMALL_VISION, moving_frames, small_policy
 from mme_vla.types import FrameBatch
 
 SPEC = StorageSpec(2, keep_every=2)
@@ -47,7 +47,8 @@ def test_a_lazy_history_holds_what_an_eager_one_does(rendered: np.ndarray | None
     "model", ["ttt_expert", "rmt_context", "bank_modul", "anchors_modul", "moment_modul", "gist_modul"]
 )
 def test_a_policy_encodes_the_frames_it_reads_and_acts_as_ever(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    policy, frames = small_policy(model), moving_frames(40)
+    policy = small_policy(model, backbone={"vision": {**SMALL_VISION, "patch_size": 8}})
+    frames = moving_frames(40)
 
     def actions(policy: MMEPolicy) -> tuple[list[np.ndarray], int]:
         n_frames, chunks = 0, []

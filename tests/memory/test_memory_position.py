@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mme_vla import UserError
+from mme_vla import UserError, build_policy
 from mme_vla.backbone.layers import apply_custom_positions, token_positions
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
@@ -115,11 +115,11 @@ def test_an_episode_and_a_cache_place_memory_alike() -> None:
 
 def test_what_has_no_time_or_no_place_for_it_is_refused() -> None:
     with pytest.raises(UserError, match=r"memory_position=time.*'rmt'"):
-        small_policy("rmt_modul", integration={"memory_position": "time"})
+        build_policy("rmt_modul", integration={"memory_position": "time"}, device="meta")
     with pytest.raises(UserError, match=r"'nano' has no place for blocks"):
-        small_policy("framesamp_context", backbone="nano", integration={"memory_position": "time"})
+        build_policy("framesamp_context", backbone="nano", integration={"memory_position": "time"}, device="meta")
     with pytest.raises(UserError, match="Did you mean 'time'"):
-        small_policy("framesamp_modul", integration={"memory_position": "tme"})
+        build_policy("framesamp_modul", integration={"memory_position": "tme"}, device="meta")
 
 
 def test_tokens_that_do_not_tell_their_age_are_not_taken_for_new_ones() -> None:

@@ -17,7 +17,6 @@ from helpers.recurrent_memories import (
     window,
 )
 from mme_vla import UserError
-from mme_vla.memory.base import stack_history
 from mme_vla.memory.recurrent import jittered, recurrent_frames
 from mme_vla.memory.ttt import TTT
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
@@ -128,18 +127,6 @@ def test_front_padding_never_matters(make):
         torch.nn.functional.pad(tokens.mask, (around, 0)),
     )
     assert same_memory(memory(tokens), memory(padded))
-
-
-def test_selections_of_different_length_stack(make):
-    memory = make()
-    items = [memory.gather_selection(RandomHistory(length), length - 1) for length in (10, 100)]
-    stacked = stack_history(items)
-    assert stacked.mask.sum(1).tolist() == [GRID**2, 7 * GRID**2]
-    assert stacked.mask[:, -(GRID**2) :].all()
-    with torch.no_grad():
-        both = memory(stacked)
-        short = memory(stack_history(items[:1]))
-    assert torch.allclose(both.tokens[0][short.mask[0]], short.tokens[short.mask], atol=TOLERANCE)
 
 
 def test_chunks_and_recomputation_change_neither_numbers_nor_gradients(make):

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from helpers.lerobot_window import ONLY, RECORDED, SETTINGS, VISION, as_batch, inputs, weights, window_policy
 from helpers.union_frames import both_ways
-from mme_vla import UserError
+from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import TrainingDataset, collate
 from mme_vla.data.sources import open_sources
 from mme_vla.memory.history import CachedHistory
@@ -177,15 +177,15 @@ def test_it_joins_with_others_and_two_that_read_past_frames_are_refused() -> Non
 
 def test_where_it_has_no_place_a_sentence_says_so() -> None:
     with pytest.raises(UserError, match="'nano' sees one image at a time"):
-        small_policy("spacetime_modul", backbone="nano")
+        build_policy("spacetime_modul", backbone="nano", device="meta")
     with pytest.raises(UserError, match="produces no tokens with these settings"):
-        small_policy("spacetime_context", memory={"states": False})
+        build_policy("spacetime_context", memory={"states": False}, device="meta")
     with pytest.raises(UserError, match="leave nothing to remember"):
-        small_policy("spacetime_context", memory={"states": False, "views": False})
+        build_policy("spacetime_context", memory={"states": False, "views": False}, device="meta")
     with pytest.raises(UserError, match="a memory without an integration"):
-        small_policy("spacetime_context", integration="none")
+        build_policy("spacetime_context", integration="none", device="meta")
     with pytest.raises(UserError, match=r"integration\.mutual=true"):
-        small_policy("framesamp_context", integration={"mutual": True, "memory_position": "time"})
+        build_policy("framesamp_context", integration={"mutual": True, "memory_position": "time"}, device="meta")
 
 
 def test_past_frames_of_one_camera_are_not_enough() -> None:

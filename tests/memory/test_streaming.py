@@ -25,9 +25,9 @@ def frames():
 
 
 @pytest.fixture(scope="module")
-def offline(policy, frames):
-    """The cache of the episode, with twenty frames of a video."""
-    return cached_history(policy, frames, exec_start=20)
+def framesamp():
+    """One policy, for what no memory decides."""
+    return small_policy("framesamp_modul", policy={"history_dtype": "float32"}, backbone=FEW_TOKENS)
 
 
 def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upto=None):
@@ -39,25 +39,6 @@ def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upt
         count = len(frames[part])
         episode.observe(view, np.zeros((count, 8), np.float32), np.arange(start, start + count) < demo)
     return episode
-
-
-@pytest.mark.parametrize("chunk", [1, 7, 16])
-def test_selection_is_the_same_online_and_from_the_cache(policy, frames, offline, chunk):
-    for step in (0, 6, 7, 40, FRAMES - 1):
-        online = online_history(policy, frames[: step + 1], chunk, exec_start=min(20, step + 1))
-        assert np.array_equal(policy.memory.select(online, step), policy.memory.select(offline, step)), step
-        a, b = policy.memory.gather_selection(online, step), policy.memory.gather_selection(offline, step)
-        assert torch.equal(a.mask, b.mask)
-        assert torch.equal(a.positions, b.positions)
-        assert torch.allclose(a.features, b.features, atol=1e-5)
-
-
-def test_nothing_later_than_the_step_decides(policy, frames):
-    changed = frames.copy()
-    changed[41:] = 255 - changed[41:]
-    a = policy.memory.select(cached_history(policy, frames), 40)
-    b = policy.memory.select(cached_history(policy, changed), 40)
-    assert np.array_equal(a, b)
 
 
 def test_streaming_and_offline_give_the_same_actions(policy, frames):
@@ -92,18 +73,18 @@ def test_a_batch_of_episodes_acts_as_each_alone(policy, frames):
     assert np.abs(together - alone).max() < 1e-4
 
 
-def test_acting_adds_nothing_to_memory(policy, frames):
-    episode = feed(policy, frames, upto=20)
+def test_acting_adds_nothing_to_memory(framesamp, frames):
+    episode = feed(framesamp, frames, upto=20)
     before = len(episode.history)
-    policy.act([episode])
-    policy.act([episode])
+    framesamp.act([episode])
+    framesamp.act([episode])
     assert len(episode.history) == before == 20
 
 
-def test_episodes_refuse_what_they_cannot_use(policy, frames):
-    episode = policy.start_episode("press the button")
+def test_episodes_refuse_what_they_cannot_use(framesamp, frames):
+    episode = framesamp.start_episode("press the button")
     with pytest.raises(UserError, match="No frame was observed"):
-        policy.act([episode])
+        framesamp.act([episode])
     state = np.zeros((2, 8), np.float32)
     with pytest.raises(UserError, match="wrist"):
         episode.observe({"front": frames[:2]}, state)
@@ -142,8 +123,8 @@ def test_tokendrop_encodes_only_the_frames_it_can_choose(frames, monkeypatch):
     assert sum(counted) == 1 + FRAMES // 8
 
 
-def test_an_error_leaves_the_episode_as_it_was(policy, frames):
-    episode = feed(policy, frames, upto=20, demo=0)
+def test_an_error_leaves_the_episode_as_it_was(framesamp, frames):
+    episode = feed(framesamp, frames, upto=20, demo=0)
     before = episode.gather_selection()
     both = {"front": frames[:3], "wrist": frames[:3]}
     states = np.zeros((3, 8), np.float32)
@@ -160,13 +141,13 @@ def test_an_error_leaves_the_episode_as_it_was(policy, frames):
     assert torch.equal(episode.gather_selection().features, before.features)
 
 
-def test_acting_without_statistics_is_refused_before_anything_moves(policy, frames):
-    episode = feed(policy, frames, upto=5, demo=0)
-    stats, policy.processor.stats = policy.processor.stats, None
+def test_acting_without_statistics_is_refused_before_anything_moves(framesamp, frames):
+    episode = feed(framesamp, frames, upto=5, demo=0)
+    stats, framesamp.processor.stats = framesamp.processor.stats, None
     try:
         with pytest.raises(UserError, match="statistics"):
-            policy.act([episode])
+            framesamp.act([episode])
     finally:
-        policy.processor.stats = stats
-    untouched = policy.start_episode(episode.goal, seed=0).noise_state
+        framesamp.processor.stats = stats
+    untouched = framesamp.start_episode(episode.goal, seed=0).noise_state
     assert torch.equal(episode.noise_state, untouched)

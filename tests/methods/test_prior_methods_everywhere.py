@@ -4,17 +4,17 @@ import io
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
 
+from helpers.depth_env import make_depth_env, readings
 from helpers.h5_files import write_file
-from helpers.prior_vla_runs import TOWERS, losses, run
+from helpers.prior_vla_runs import TOWERS, UNTESTED, losses, run
 from helpers.rollout_fakes import InlineEnvs, roll
-from helpers.scripted_env import ScriptedEnv, make_scripted_env
+from helpers.scripted_env import SIZE, make_scripted_env
 from helpers.serving_fakes import Served, challenge
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
@@ -32,14 +32,11 @@ from mme_vla.probing.arms import read_arms
 from mme_vla.probing.lines import MomentLine
 from mme_vla.probing.offline import OfflineSettings, probe_offline
 
-SIDE, POSE = 64, np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
 LLAMA = [*TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32"]
 OFT = [*LLAMA, "backbone.vision.image_size=32", "backbone.vision.patch_size=2"]
 SHORT = {
     "diffusion_policy": ["backbone.diffusion_steps=4", "backbone.widths=[16,32]", "backbone.picture=[40,40]"],
-    **{
-        f"openvla_oft{kind}": OFT for kind in ("", "_simplesg", "_groundsg", "_tokendrop_context", "_framesamp_context")
-    },
+    **{f"openvla_oft{kind}": OFT for kind in ("", "_simplesg", "_tokendrop_context")},
     "memoryvla": [*LLAMA, "backbone.vision.image_size=28", "backbone.head.depth=1", "processor.group_size=3"],
     "sam2act_plus": ["train.warmup=1"],
     "simplememvla": [
@@ -48,7 +45,8 @@ SHORT = {
         "backbone.vlm.text_config.full_attention_interval=2",
     ],
 }  # fmt: skip
-PAPER_ROWS = [model for model in SHORT if model != "simplememvla"]
+OTHER_ROWS = ["openvla_oft_groundsg", "openvla_oft_framesamp_context"]
+PAPER_ROWS = [*(model for model in SHORT if model != "simplememvla"), *OTHER_ROWS]
 pytestmark = pytest.mark.filterwarnings("ignore:.*loses its end")
 
 
@@ -82,9 +80,8 @@ def trained(data: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory
 
 def update(model: str, data: str, folder: Path, *words: str) -> Path:
     """Train a model on two samples an update; the last checkpoint."""
-    small = [*SHORT[model], f"data.sources=[{data}]", "data.val_episodes=[]", "train.batch_size=2"]
-    small += ["train.val_samples=0", "train.open_loop_chunks=0", *words]
-    return run(model, folder, *small, short=["logger=none", "train.workers=0", "train.device=cpu", "train.log_every=1"])
+    small = [*SHORT[model], f"data.sources=[{data}]", "train.batch_size=2", *words]
+    return run(model, folder, *small, short=UNTESTED)
 
 
 @pytest.fixture(scope="module")
@@ -92,35 +89,8 @@ def loaded(trained: Callable[[str], Path]) -> Callable[[str], Policy]:
     return cache(lambda model: Policy.from_pretrained(trained(model)).eval())
 
 
-class DepthEnv(ScriptedEnv):
-    """The scripted environment, seen with depth; a motion is four frames."""
-
-    motion = 4
-
-    def step(self, action: np.ndarray) -> Any:
-        self.actions.append(np.array(action))
-        return self._lists([self._frame() for _ in range(self.motion)]), 0.0, False, False, self._info("ongoing")
-
-    def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
-        return super()._lists(frames) | readings(len(frames), listed=True)
-
-
-def readings(count: int, listed: bool = False) -> dict[str, Any]:
-    """Depth and poses of both cameras, as an environment or a client sends them."""
-    rng = np.random.default_rng(count)
-    readings_: dict[str, Any] = {}
-    for camera in ("front", "wrist"):
-        readings_[f"{camera}_depth"] = rng.integers(400, 900, (count, SIDE, SIDE, 1)).astype(np.int16)
-        readings_[f"{camera}_camera_extrinsic"] = np.tile(POSE, (count, 1, 1))
-    return {f"{name}_list": list(values) for name, values in readings_.items()} if listed else readings_
-
-
-def make_depth_env(task: str, split: str, episode: int, max_steps: int, **options: Any) -> DepthEnv:
-    return DepthEnv(task, episode, max_steps, 1e9, 0.0, "")
-
-
 RESUMED = {
-    **{model: (model, []) for model in ("diffusion_policy", "openvla_oft", "memoryvla", "sam2act_plus")},
+    "memoryvla": ("memoryvla", []),
     "decaying rates": ("diffusion_policy", ["train.schedule=cosine", "train.schedule_steps=3", "train.ema_warmup=true",
                                             "train.warmup_from_zero=true", "train.warmup=1", "train.decay_min_dim=2"]),
     "adapters": ("openvla_oft", ["finetune=oft", "finetune.rank=2"]),
@@ -161,7 +131,7 @@ def test_it_is_evaluated(model: str, loaded: Callable[[str], Policy]) -> None:
 def test_it_is_served_what_it_answers_itself(model: str, loaded: Callable[[str], Policy]) -> None:
     policy, robot = loaded(model), loaded(model).embodiment
     rng = np.random.default_rng(0)
-    front, wrist = (rng.integers(0, 255, (5, SIDE, SIDE, 3), np.uint8) for _ in range(2))
+    front, wrist = (rng.integers(0, 255, (5, SIZE, SIZE, 3), np.uint8) for _ in range(2))
     states, beside = np.full((5, 8), 0.04, np.float32), readings(5)
     images = {"front": front, "wrist": wrist} | {name: beside[name] for name in robot.readings}
     episode = policy.start_episode("pick up the cube", seed=42)
@@ -194,7 +164,7 @@ def test_it_is_probed_on_recordings(
 def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str], Policy]) -> None:
     policy, frames, states = (
         loaded("sam2act_plus"),
-        np.zeros((2, SIDE, SIDE, 3), np.uint8),
+        np.zeros((2, SIZE, SIZE, 3), np.uint8),
         np.zeros((2, 8), np.float32),
     )
     lists = readings(2, listed=True)
@@ -214,7 +184,7 @@ def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str],
 
 
 def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(loaded: Callable[[str], Policy]) -> None:
-    policy, image = loaded("sam2act_plus"), np.full((SIDE, SIDE, 3), 9, np.uint8)
+    policy, image = loaded("sam2act_plus"), np.full((SIZE, SIZE, 3), 9, np.uint8)
     beside = readings(1)
     episode = policy.start_episode("pick up the cube", seed=42)
     episode.observe({"front": image[None], "wrist": image[None], **beside}, np.full((1, 8), 0.04, np.float32))
@@ -228,20 +198,18 @@ def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(loaded: Ca
         np.testing.assert_array_equal(client.infer(message)["actions"], policy.act(episode))
 
 
-def test_a_sam2act_episode_ends_after_its_waypoints(loaded: Callable[[str], Policy]) -> None:
-    policy = loaded("sam2act_plus")
-    assert policy.max_actions == policy.require_processor().waypoints == 40
-    envs = InlineEnvs(base=make_depth_env, robot=policy.embodiment, max_steps=10_000, max_actions=3)
-    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=10_000)
-    assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 3, 3 * DepthEnv.motion)
-
-
-@pytest.mark.parametrize("model", PAPER_ROWS)
-def test_it_is_explained_by_inspect_and_stands_beside_its_paper_row(model: str, trained: Callable[[str], Path]) -> None:
+@pytest.mark.parametrize("model", SHORT)
+def test_inspect_names_its_parts(model: str, trained: Callable[[str], Path], loaded: Callable[[str], Policy]) -> None:
+    policy = loaded(model)
+    parts = {policy.finetune_spec.component_of(name) for name, _ in policy.named_parameters()}
     console = Console(record=True, width=200, file=io.StringIO())
     show_checkpoint(trained(model), console)
     output = console.export_text()
-    assert all(word in output for word in ("parameters", "action", "normalisation", model))
+    assert "action" in parts and all(word in output for word in ("parameters", "normalisation", model, *parts))
+
+
+@pytest.mark.parametrize("model", PAPER_ROWS)
+def test_it_stands_beside_its_paper_row(model: str) -> None:
     subgoal = {"openvla_oft_simplesg": "qwenvl", "openvla_oft_groundsg": "qwenvl"}.get(model)
     method = paper_method(model, subgoal)
     assert method is not None and method.family == "prior" and 0 <= average(method.name).mean < 30

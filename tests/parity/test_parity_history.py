@@ -23,8 +23,6 @@ TOLERANCE = 1e-4
 
 @pytest.fixture(scope="module")
 def buffer(parity):
-    if not (parity / "unit_memory_buffer.safetensors").is_file():
-        pytest.skip(f"unit_memory_buffer is not in {parity}")
     return load(parity, "unit_memory_buffer")
 
 

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from helpers.chat_server import ChatServer, Reply, chat_server, failure, says
+from helpers.subgoal_fakes import frames
 from mme_vla.errors import UserError
 from mme_vla.subgoal import NotebookPredictor, build_predictor
 from mme_vla.subgoal.notebook import MONITOR, Count, Identity, Notebook, Route, read_notes
@@ -16,10 +16,6 @@ from mme_vla.subgoal.text import MalformedReply
 
 QUICK = {"backoff": 0, "requests_per_minute": None, "retries": 0}
 COUNT = {"kind": "count", "name": "placed", "value": 0}
-
-
-def frames(count: int, first: int = 0) -> np.ndarray:
-    return np.stack([np.full((32, 32, 3), (first + t) % 256, np.uint8) for t in range(count)])
 
 
 # Notes --------------------------------------------------------------------------------------------------------------

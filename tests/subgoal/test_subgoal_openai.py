@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from helpers.chat_server import ChatServer, chat_server, failure, says
+from helpers.subgoal_fakes import frames
 from mme_vla.errors import UserError
 from mme_vla.play import OpenAIPlayer
 from mme_vla.subgoal import OpenAI, build_predictor
@@ -29,10 +30,6 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[ChatServer]:
     monkeypatch.setenv("OPENAI_API_KEY", SECRET)
     with chat_server() as match:
         yield match
-
-
-def frames(count: int, first: int = 0) -> np.ndarray:
-    return np.stack([np.full((32, 32, 3), (first + t) % 256, np.uint8) for t in range(count)])
 
 
 def subgoal(text: str) -> tuple[int, dict[str, Any]]:

@@ -1,10 +1,12 @@
 """Predictors with a model of their own: what they ask, what they make of any answer, and a tiny Qwen3-VL."""
 
 import logging
+from functools import partial
 
 import numpy as np
 import pytest
 
+from helpers import subgoal_fakes
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal import Memer, Oracle, QwenVL, build_predictor
@@ -26,9 +28,7 @@ class Scripted:
         return [Completion(self.answers.pop(0), 100, 7) for _ in questions]
 
 
-def frames(count, first=0, size=256):
-    """Images that show their number in every pixel."""
-    return np.stack([np.full((size, size, 3), (first + t) % 256, np.uint8) for t in range(count)])
+frames = partial(subgoal_fakes.frames, size=256)
 
 
 def at_start(predictor, goal="Sort the Cubes", task="", video=0):

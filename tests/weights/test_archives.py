@@ -6,8 +6,8 @@ from pathlib import Path
 
 import huggingface_hub
 import pytest
-import torch
 
+from helpers.memory_fakes import same
 from mme_vla.cli.weights import convert
 from mme_vla.errors import UserError
 from mme_vla.policy.build import build_policy
@@ -37,11 +37,6 @@ def published(policy: MMEPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pa
         for file in sorted((folder.parent / "run" / "0").rglob("*")):
             archive.write(file, Path("79999") / file.relative_to(folder.parent / "run" / "0"))
     return folder
-
-
-def same(one: MMEPolicy, other: MMEPolicy) -> bool:
-    mine, reference = one.state_dict(), other.state_dict()
-    return set(mine) == set(reference) and all(torch.equal(tensor, reference[name]) for name, tensor in mine.items())
 
 
 @pytest.mark.parametrize("named", [lambda folder: folder, lambda folder: folder / "79999.zip"], ids=["folder", "zip"])

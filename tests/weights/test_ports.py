@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from helpers.lerobot_pi05 import reduce_sizes
+from helpers.memory_fakes import same
 from mme_vla import UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.policy.mme import MMEPolicy
@@ -68,11 +69,6 @@ def saved(tensors: Tensors, folder: Path) -> Path:
 
 def empty_pi05(**overrides: Any) -> MMEPolicy:
     return build_policy("pi05", device="meta", **overrides)
-
-
-def same(one: MMEPolicy, other: MMEPolicy) -> bool:
-    mine, reference = one.state_dict(), other.state_dict()
-    return set(mine) == set(reference) and all(torch.equal(tensor, reference[name]) for name, tensor in mine.items())
 
 
 @pytest.mark.parametrize("spelling", SPELLINGS)

@@ -12,6 +12,7 @@ import torch
 pytest.importorskip("diffusers")
 
 
+from helpers.memory_fakes import same
 from mme_vla import Policy, UserError, build_policy, load_weights
 from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose
@@ -46,8 +47,7 @@ def test_weights_go_to_the_authors_format_and_back(policy: DiffusionPolicy, tmp_
     torch.save({**saved, "model": wrapped}, tmp_path / "theirs" / "model.pth")
     other = build_policy("diffusion_policy", seed=1)
     load_weights(other, tmp_path / "theirs")
-    for name, tensor in policy.state_dict().items():
-        assert torch.equal(tensor, other.state_dict()[name]), name
+    assert same(policy, other)
     convert(tmp_path / "theirs", tmp_path / "back", ["backbone=dp_tiny"])
     back = Policy.from_pretrained(tmp_path / "back")
     assert torch.equal(

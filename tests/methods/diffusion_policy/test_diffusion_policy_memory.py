@@ -40,7 +40,7 @@ def history(policy: DiffusionPolicy, seed: int) -> HistoryTokens:
     return HistoryTokens(torch.randn(full.features.shape, generator=generator), full.positions, full.mask)
 
 
-@pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "rmt", "ttt"])
+@pytest.mark.parametrize("memory", ["tokendrop", "ttt"])
 def test_any_memory_joins_the_condition(memory: str) -> None:
     policy = with_memory(memory)
     batch = policy.full_batch()

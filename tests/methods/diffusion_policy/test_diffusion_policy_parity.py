@@ -6,12 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from helpers.baselines import baselines_folder, relative_error, rule_weight
+from helpers.baselines import baselines_folder, case, relative_error, rule_weight
 
 pytest.importorskip("diffusers")
 
@@ -32,13 +31,6 @@ SINGLE, SAMPLES, GRADIENTS = 2e-5, 1e-4, 5e-3  # a CPU without AVX-512 has gradi
 @pytest.fixture(scope="module")
 def folder() -> Path:
     return baselines_folder("diffusion_policy")
-
-
-def case(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    with np.load(folder / f"{name}.npz") as arrays:
-        return {key: torch.from_numpy(arrays[key]) for key in arrays.files}, json.loads(
-            (folder / f"{name}.json").read_text()
-        )
 
 
 def models(folder: Path) -> list[str]:

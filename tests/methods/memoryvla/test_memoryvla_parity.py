@@ -1,5 +1,6 @@
 """MemoryVLA: the original's modules, banks, head, training loss and acting, at the golden network's size."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.baselines import baselines_folder
-from helpers.golden import error
-from helpers.memoryvla_golden import about, arrays, bank, core, golden_name
+from helpers.baselines import arrays, baselines_folder, relative_error
+from helpers.memoryvla_golden import bank, core, golden_name
 from mme_vla.memory.extensions.bank import BankState, MemoryBank
 from mme_vla.methods.memoryvla.action_head import Schedule
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, cognition_token
@@ -26,7 +26,7 @@ def folder() -> Path:
 
 @pytest.fixture(scope="module")
 def meta(folder: Path) -> dict[str, Any]:
-    return about(folder)
+    return json.loads((folder / "meta.json").read_text())  # type: ignore[no-any-return]
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,7 @@ def network(meta: dict[str, Any], weights: dict[str, Tensor]) -> MemoryVlaCore:
 
 
 def near(ours: Tensor, golden: Tensor, tolerance: float = TOLERANCE) -> None:
-    largest = float(golden.double().abs().max()) or 1.0
-    worst = error(ours.detach().double() / largest, golden.double() / largest)
-    assert worst <= tolerance, f"{worst:.2e} of the largest entry, {largest:.2e}"
+    assert relative_error(ours, golden) <= tolerance
 
 
 @torch.no_grad()

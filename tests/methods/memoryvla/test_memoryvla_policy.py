@@ -18,6 +18,12 @@ def tiny() -> MemoryVlaPolicy:
     return reached(backbone={**SMALL}, processor={"group_size": 4})
 
 
+@pytest.fixture(scope="module")
+def policy() -> MemoryVlaPolicy:
+    """For tests that change nothing in it."""
+    return tiny()
+
+
 def frames(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     return {name: rng.integers(0, 256, (count, 32, 32, 3), dtype=np.uint8) for name in ("front", "wrist")}
@@ -31,8 +37,7 @@ def groups(policy: MemoryVlaPolicy) -> GroupDataset:
     return GroupDataset(open_sources(["sample"], policy.embodiment), policy.require_processor())
 
 
-def test_a_group_is_of_one_episode_in_the_order_of_time_and_sampled_anew_every_epoch() -> None:
-    policy = tiny()
+def test_a_group_is_of_one_episode_in_the_order_of_time_and_sampled_anew_every_epoch(policy: MemoryVlaPolicy) -> None:
     data = groups(policy)
     first, again = data[1], data[1]
     assert np.array_equal(first["times"], again["times"])
@@ -46,8 +51,7 @@ def test_a_group_is_of_one_episode_in_the_order_of_time_and_sampled_anew_every_e
         data[len(data)]
 
 
-def test_the_group_before_a_step_is_where_the_policy_would_have_been_requested() -> None:
-    policy = tiny()
+def test_the_group_before_a_step_is_where_the_policy_would_have_been_requested(policy: MemoryVlaPolicy) -> None:
     data = groups(policy)
     _, _, frame = data.locate(30)
     assert data.observation(30)["times"].tolist() == [max(frame, 0) - 8 * i for i in (3, 2, 1, 0)]
@@ -58,8 +62,7 @@ def batch_of(policy: MemoryVlaPolicy, count: int = 2) -> GroupBatch:
     return policy.require_processor().collate([data[i] for i in range(count)])
 
 
-def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
-    policy = tiny()
+def test_the_loss_repeats_with_its_draws_and_reaches_every_part(policy: MemoryVlaPolicy) -> None:
     batch = batch_of(policy)
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     loss, metrics = policy(batch, draws)
@@ -87,8 +90,9 @@ def test_images_are_changed_by_their_draws_alone_whatever_stands_beside_them() -
 
 
 @torch.no_grad()
-def test_actions_repeated_past_the_end_count_only_where_they_are_requested(monkeypatch) -> None:
-    policy = tiny()
+def test_actions_repeated_past_the_end_count_only_where_they_are_requested(
+    policy: MemoryVlaPolicy, monkeypatch
+) -> None:
     data, collate = groups(policy), policy.require_processor().collate
     baseline = collate([data[0], data.observation(data.steps - 1)])
     data.mask_padding = True
@@ -105,8 +109,7 @@ def test_actions_repeated_past_the_end_count_only_where_they_are_requested(monke
     torch.testing.assert_close(policy(batch)[0], expected.mean())
 
 
-def test_acting_twice_at_one_frame_stores_one_entry_and_gives_the_same_chunk() -> None:
-    policy = tiny()
+def test_acting_twice_at_one_frame_stores_one_entry_and_gives_the_same_chunk(policy: MemoryVlaPolicy) -> None:
     episode = policy.start_episode("press the button", seed=3)
     episode.observe(frames(1), states(1))
     start = episode.noise_state
@@ -122,9 +125,10 @@ def test_acting_twice_at_one_frame_stores_one_entry_and_gives_the_same_chunk() -
 
 
 @pytest.mark.parametrize(("length", "saved"), [(17, 2), (18, 3), (1, 0), (8, 1)])
-def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, saved: int) -> None:
+def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(
+    policy: MemoryVlaPolicy, length: int, saved: int
+) -> None:
     """However the frames arrive: at once, or one by one."""
-    policy = tiny()
     video, now = frames(length), frames(1, seed=1)
     straight, parts = (policy.start_episode("press the button") for _ in range(2))
     together = {name: np.concatenate([video[name], now[name]]) for name in video}
@@ -138,9 +142,8 @@ def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, 
     np.testing.assert_allclose(policy.act(straight), policy.act(parts), atol=1e-4)
 
 
-def test_a_video_that_comes_before_its_goal_is_read_with_the_goal() -> None:
+def test_a_video_that_comes_before_its_goal_is_read_with_the_goal(policy: MemoryVlaPolicy) -> None:
     """As over the MME-VLA protocol, where past frames come before the first prompt."""
-    policy = tiny()
     apart, together = policy.start_episode(""), policy.start_episode("press the button")
     video = frames(17)
     for episode in (apart, together):
@@ -153,8 +156,7 @@ def test_a_video_that_comes_before_its_goal_is_read_with_the_goal() -> None:
     assert not torch.equal(other.banks.cognition.entries, apart.banks.cognition.entries)
 
 
-def test_episodes_in_one_batch_act_as_alone_and_their_past_matters() -> None:
-    policy = tiny()
+def test_episodes_in_one_batch_act_as_alone_and_their_past_matters(policy: MemoryVlaPolicy) -> None:
     chunks = {}
     for batched in (True, False):
         pair = [policy.start_episode("press the button", seed=i) for i in range(2)]
@@ -171,8 +173,7 @@ def test_episodes_in_one_batch_act_as_alone_and_their_past_matters() -> None:
 
 
 @torch.no_grad()
-def test_acting_over_a_stream_equals_a_group_of_its_moments() -> None:
-    policy = tiny()
+def test_acting_over_a_stream_equals_a_group_of_its_moments(policy: MemoryVlaPolicy) -> None:
     processor = policy.require_processor()
     episode, images = policy.start_episode("press the button"), frames(3)
     for i in range(3):
@@ -188,8 +189,8 @@ def test_acting_over_a_stream_equals_a_group_of_its_moments() -> None:
     np.testing.assert_allclose(chunk, expected, atol=1e-4)
 
 
-def test_a_prompt_ends_in_the_opening_piece_and_the_end_of_the_text() -> None:
-    processor = tiny().require_processor()
+def test_a_prompt_ends_in_the_opening_piece_and_the_end_of_the_text(policy: MemoryVlaPolicy) -> None:
+    processor = policy.require_processor()
     with pytest.warns(UserWarning, match="loses its end"):
         cut = processor.prompt("press " * 200)
     for ids, mask in (processor.prompt("press the button"), cut):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from helpers.memory_fakes import same
 from mme_vla import UserError, build_policy
 from mme_vla.methods.memoryvla.weights import memoryvla_adapter
 from mme_vla.methods.openvla_oft.weights import VLA, openvla_adapter
@@ -26,8 +27,7 @@ def test_a_checkpoint_is_saved_by_components_and_read_again(tmp_path: Path) -> N
     torch.save({"model": model}, file)
     assert detect_format(file) == "memoryvla"
     load_weights(other, file)
-    for name, tensor in policy.state_dict().items():
-        assert torch.equal(tensor, other.state_dict()[name]), name
+    assert same(policy, other)
 
 
 def of_vlm(policy: Policy) -> dict[str, torch.Tensor]:

@@ -24,11 +24,15 @@ def published() -> dict[str, Any]:
     return json.loads((folder / "full_size_names.json").read_text())  # type: ignore[no-any-return]
 
 
-@pytest.fixture
-def policy() -> MMEPolicy:
+def full_size() -> MMEPolicy:
     built = build_policy("openvla_oft", backbone="openvla", device="meta")
     assert isinstance(built, MMEPolicy)
     return built
+
+
+@pytest.fixture(scope="module")
+def policy() -> MMEPolicy:
+    return full_size()
 
 
 def named(policy: MMEPolicy) -> dict[str, list[int]]:
@@ -53,9 +57,8 @@ def test_parameters_are_counted_as_published(policy: MMEPolicy, published: dict[
         assert sum(p.numel() for p in module.parameters()) == counts[name], name
 
 
-def test_adapters_are_the_published_ones_and_all_that_learns_beside_head_and_state(
-    policy: MMEPolicy, published: dict[str, Any]
-) -> None:
+def test_adapters_are_the_published_ones_and_all_that_learns_beside_head_and_state(published: dict[str, Any]) -> None:
+    policy = full_size()
     with torch.device("meta"):
         learning = apply_finetuning(policy, "lora", freeze_vision=False, **OFT)
     shapes = {name: shape for name, shape in named(policy).items() if ".lora_" in name}

@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.baselines import baselines_folder
+from helpers.baselines import baselines_folder, case
 from helpers.golden import error
-from helpers.openvla_golden import case
 from mme_vla import UserError
 from mme_vla.methods.openvla_oft import processor as image_ops
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles

@@ -9,9 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.baselines import baselines_folder, rule_weight
-from helpers.golden import error
-from helpers.openvla_golden import batch, case, fused, golden_name, policy
+from helpers.baselines import baselines_folder, case, relative_error, rule_weight
+from helpers.openvla_golden import batch, fused, golden_name, policy
 from mme_vla.backbone.layers import additive_mask
 from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.methods.openvla_oft.model import OpenVlaBackbone, TokenSequence, absolute_error
@@ -30,9 +29,7 @@ def folder() -> Path:
 
 
 def near(ours: Tensor, golden: Tensor, tolerance: float = TOLERANCE) -> None:
-    largest = float(golden.double().abs().max()) or 1.0
-    worst = error(ours.double() / largest, golden.double() / largest)
-    assert worst <= tolerance, f"{worst:.2e} of the largest entry, {largest:.2e}"
+    assert relative_error(ours, golden) <= tolerance
 
 
 class Stages:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from helpers.memory_fakes import same
 from mme_vla import UserError, build_policy
 from mme_vla.methods.openvla_oft.weights import VLA, openvla_name
 from mme_vla.policy.base import Policy
@@ -29,11 +30,6 @@ def saved(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
     return folder
 
 
-def equal(one: Policy, other: Policy) -> bool:
-    reference = other.state_dict()
-    return all(torch.equal(value, reference[name]) for name, value in one.state_dict().items())
-
-
 def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) -> None:
     policy = built()
     folder = saved(policy, tmp_path / "run")
@@ -44,9 +40,9 @@ def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) ->
     assert "module.model.mlp_resnet_blocks.1.ffn.1.weight" in head
     other = built(seed=2)
     other.require_processor().stats = None
-    assert not equal(policy, other)
+    assert not same(policy, other)
     load_weights(other, folder)
-    assert equal(policy, other) and other.require_processor().stats is not None
+    assert same(policy, other) and other.require_processor().stats is not None
 
 
 @pytest.mark.parametrize("module", ["vision_backbone", "noisy_action_projector"])

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.depth_env import readings
 from helpers.h5_files import write_file
+from helpers.scripted_env import SIZE
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
@@ -17,8 +19,6 @@ from mme_vla.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.methods.sam2act.processor import KeyframeBatch
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
-
-DOWN = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
 
 
 def built(**overrides: Any) -> SAM2ActPolicy:
@@ -48,12 +48,9 @@ def batch_of(policy: SAM2ActPolicy, data: Path, count: int = 2) -> KeyframeBatch
 
 def views(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     """What an environment delivers of `count` frames."""
-    rng, observations = np.random.default_rng(seed), {}
-    for camera in ("front", "wrist"):
-        observations[camera] = rng.integers(0, 255, (count, 64, 64, 3), np.uint8)
-        observations[f"{camera}_depth"] = rng.integers(400, 1000, (count, 64, 64, 1)).astype(np.int16)
-        observations[f"{camera}_camera_extrinsic"] = np.tile(DOWN, (count, 1, 1))
-    return observations
+    rng = np.random.default_rng(seed)
+    images = {name: rng.integers(0, 255, (count, SIZE, SIZE, 3), np.uint8) for name in ("front", "wrist")}
+    return images | readings(count, seed)
 
 
 def states(count: int) -> np.ndarray:
@@ -69,7 +66,7 @@ def test_each_stage_learns_what_it_trains_and_leaves_the_remainder(data: Path, s
     batch, optimizer = batch_of(policy, data), torch.optim.Adam(trained, 3e-3)
     losses = []
     policy.eval()  # neither dropout nor augmentation: the same samples again and again
-    for _ in range(6):
+    for _ in range(3):
         loss, metrics = policy(batch)
         optimizer.zero_grad()
         loss.backward()

@@ -1,49 +1,16 @@
 """SAM2Act+ in a rollout: depth and poses of cameras come along, one waypoint is one motion of many frames."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
+from helpers.depth_env import MOTION, DepthEnv, make_depth_env
 from helpers.rollout_fakes import InlineEnvs, roll
-from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.environment import ChunkEnv
 from mme_vla.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.build import build_policy
-
-MOTION, SIZE = 40, 64
-DOWN = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
-
-
-class MotionEnv(ScriptedEnv):
-    """Moves for `MOTION` frames a waypoint, sees with depth, and succeeds after three motions."""
-
-    def __init__(self, task: str, episode: int, blind: bool = False) -> None:
-        super().__init__(task, episode, 1000, 1e9, 0.0, "")
-        self.blind = blind
-
-    def step(self, action: np.ndarray) -> tuple[dict[str, Any] | None, float, bool, bool, dict[str, Any]]:
-        self.actions.append(np.array(action))
-        success = len(self.actions) == 3
-        info = self._info("success" if success else "ongoing")
-        return self._lists([self._frame() for _ in range(MOTION)]), 0.0, success, False, info
-
-    def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
-        lists = super()._lists(frames)
-        if not self.blind:
-            rng = np.random.default_rng(len(self.frames))
-            for camera in ("front", "wrist"):
-                depths = rng.integers(400, 900, (len(frames), SIZE, SIZE, 1)).astype(np.int16)
-                lists[f"{camera}_depth_list"] = list(depths)
-                lists[f"{camera}_camera_extrinsic_list"] = [DOWN] * len(frames)
-        return lists
-
-
-def make_motion_env(task: str, split: str, episode: int, max_steps: int, **options: Any) -> MotionEnv:
-    return MotionEnv(task, episode, **options)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +22,7 @@ def policy() -> SAM2ActPolicy:
 
 def test_every_waypoint_is_requested_once_and_counts_its_frames(policy: SAM2ActPolicy) -> None:
     jobs = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
-    envs = InlineEnvs(2, base=make_motion_env, robot=policy.embodiment, max_steps=1000)
+    envs = InlineEnvs(2, base=make_depth_env, robot=policy.embodiment, max_steps=1000)
     records = roll(policy, jobs, envs)
     assert [record.outcome for record in records] == ["success", "success"]
     for record in records:
@@ -65,8 +32,15 @@ def test_every_waypoint_is_requested_once_and_counts_its_frames(policy: SAM2ActP
         assert [action.shape for action in env.actions] == [(7,)] * 3
 
 
+def test_an_episode_ends_after_its_waypoints(policy: SAM2ActPolicy) -> None:
+    assert policy.max_actions == policy.require_processor().waypoints == 40
+    envs = InlineEnvs(base=make_depth_env, robot=policy.embodiment, max_steps=10_000, max_actions=2)
+    (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=10_000)
+    assert (record.outcome, record.extra["chunks"], record.steps) == ("timeout", 2, 2 * MOTION)
+
+
 def test_the_last_frame_of_a_motion_is_the_keyframe(policy: SAM2ActPolicy) -> None:
-    env = ChunkEnv(lambda: MotionEnv("PickXtimes", 0), robot=policy.embodiment)
+    env = ChunkEnv(lambda: DepthEnv("PickXtimes", 0), robot=policy.embodiment)
     env.reset()
     frames, *_ = env.step({"actions": np.zeros((1, 7), np.float32)})
     episode = policy.start_episode("pick")
@@ -79,6 +53,6 @@ def test_the_last_frame_of_a_motion_is_the_keyframe(policy: SAM2ActPolicy) -> No
 
 
 def test_an_environment_without_depth_is_refused_by_name(policy: SAM2ActPolicy) -> None:
-    env = ChunkEnv(lambda: MotionEnv("PickXtimes", 0, blind=True), robot=policy.embodiment)
+    env = ChunkEnv(lambda: DepthEnv("PickXtimes", 0, blind=True), robot=policy.embodiment)
     with pytest.raises(UserError, match="The policy reads 'front_depth', which this environment does not deliver"):
         env.reset()

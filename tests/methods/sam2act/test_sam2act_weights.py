@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 
+from helpers.memory_fakes import same
 from mme_vla.errors import UserError
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
@@ -104,9 +105,7 @@ def file(policy: SAM2ActPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def test_a_file_in_the_authors_layout_comes_back_completely(policy: SAM2ActPolicy, file: Path) -> None:
     assert detect_format(file) == "sam2act_plus"
-    loaded = load_weights(build_policy("sam2act_plus", seed=1), file)
-    state = policy.state_dict()
-    assert all(torch.equal(value, state[name]) for name, value in loaded.state_dict().items())
+    assert same(load_weights(build_policy("sam2act_plus", seed=1), file), policy)
 
 
 def test_a_policy_on_meta_is_filled_with_its_constants_too(policy: SAM2ActPolicy, file: Path) -> None:
@@ -124,12 +123,12 @@ def test_a_copy_that_is_none_and_a_tensor_that_lacks_are_named(file: Path, tmp_p
     content["model_state"][copy] = content["model_state"][copy] + 1
     torch.save(content, tmp_path / "other.pth")
     with pytest.raises(UserError, match=r"mvt1.sam2.maskmem_tpos_enc is another tensor"):
-        load_weights(build_policy("sam2act_plus"), tmp_path / "other.pth")
+        load_weights(build_policy("sam2act_plus", device="meta"), tmp_path / "other.pth")
     content = torch.load(file, weights_only=True)
     del content["model_state"]["mvt2.up0.1.weight"]
     torch.save(content, tmp_path / "short.pth")
     with pytest.raises(UserError, match=r"mvt2\.up0\.1\.weight"):
-        load_weights(build_policy("sam2act_plus"), tmp_path / "short.pth")
+        load_weights(build_policy("sam2act_plus", device="meta"), tmp_path / "short.pth")
 
 
 def test_other_policies_are_refused_by_name() -> None:

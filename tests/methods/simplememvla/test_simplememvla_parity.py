@@ -12,7 +12,7 @@ from torch import Tensor
 pytest.importorskip("transformers", reason="needs the extra `vlm`: uv sync --inexact --extra vlm")
 
 from helpers.baselines import relative_error as error
-from helpers.simplememvla_golden import arrays, folder, frames, golden_policy, read, sections
+from helpers.simplememvla_golden import arrays, folder, frames, golden_policy, read
 from mme_vla.methods.simplememvla.head import Condition, channel_loss, scaled_section
 from mme_vla.methods.simplememvla.model import response_condition, words_loss
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
@@ -372,7 +372,3 @@ def test_names_and_shapes_at_full_size() -> None:
     policy = build_policy("simplememvla", backbone="simplememvla", device="meta")
     shapes = simplememvla_adapter(policy).shapes(policy.state_dict())
     assert {name: list(shape) for name, shape in shapes.items()} == read("full_size_names")
-
-
-def test_the_case_has_sizes_of_its_own() -> None:
-    assert sections()["backbone"]["horizon"] == read("meta")["sizes"]["horizon"]

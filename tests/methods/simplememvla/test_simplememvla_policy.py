@@ -1,19 +1,16 @@
 """SimpleMemVLA in a policy's hands: reading ahead, episodes, memories in the video's place, recipes."""
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from rich.console import Console
 
 pytest.importorskip("transformers", reason="needs the extra `vlm`: uv sync --inexact --extra vlm")
 
-from helpers.prior_vla_runs import losses, run
+from helpers.prior_vla_runs import UNTESTED, losses, run
 from mme_vla import UserError, build_policy
-from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.methods.simplememvla.policy import SimpleMemVlaPolicy
 from mme_vla.methods.simplememvla.prompt import CameraTokens, Robot, WordTokenizer, encode, instruction
@@ -27,19 +24,14 @@ from mme_vla.training.settings import TrainSettings
 
 SIDE = 32
 SMALL: dict[str, Any] = {
-    "processor": {"max_words": 4, "seconds": 2},
+    "processor.max_words": 4,
+    "processor.seconds": 2,
     "backbone.head.depth": 1,
     "backbone.vlm.vision_config.depth": 1,
     "backbone.vlm.text_config.num_hidden_layers": 2,
     "backbone.vlm.text_config.full_attention_interval": 2,
 }
-WORDS = [
-    "processor.max_words=4", "processor.seconds=2", "backbone.head.depth=1",
-    "backbone.vlm.vision_config.depth=1", "backbone.vlm.text_config.num_hidden_layers=2",
-    "backbone.vlm.text_config.full_attention_interval=2",
-]  # fmt: skip
-RUN = ["logger=none", "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=0",
-       "train.open_loop_chunks=0", "data.val_episodes=[]"]  # fmt: skip
+WORDS = [f"{key}={value}" for key, value in SMALL.items()]
 
 
 def small(**options: Any) -> SimpleMemVlaPolicy:
@@ -53,6 +45,12 @@ def small(**options: Any) -> SimpleMemVlaPolicy:
             if not parameter.any():
                 parameter.normal_(std=0.1, generator=generator)
     return policy.eval()
+
+
+@pytest.fixture(scope="module")
+def policy() -> SimpleMemVlaPolicy:
+    """For tests that change nothing in it."""
+    return small()
 
 
 def observations(count: int, seed: int = 0) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -76,7 +74,7 @@ def test_a_prompt_has_the_same_tokens_with_a_response_as_alone(vocabulary: str) 
 
 
 def test_reading_ahead_changes_no_action() -> None:
-    policy = small(processor={"max_words": 4, "seconds": 10})
+    policy = small(**{"processor.seconds": 10})
     views, states = observations(200)
     ahead, base = (policy.start_episode("pick up the cube", seed=3) for _ in range(2))
     observed = 0
@@ -93,7 +91,7 @@ def test_reading_ahead_changes_no_action() -> None:
 
 def test_an_interrupted_reading_ahead_is_continued_where_it_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mme_vla.methods.simplememvla.episode.PIECE", 2)
-    policy = small(processor={"max_words": 4, "seconds": 20})
+    policy = small(**{"processor.seconds": 20})
     views, states = observations(200)
     ahead, base = (policy.start_episode("pick up the cube", seed=3) for _ in range(2))
     for episode in (ahead, base):
@@ -105,13 +103,12 @@ def test_an_interrupted_reading_ahead_is_continued_where_it_stopped(monkeypatch:
     np.testing.assert_allclose(policy.act(ahead), policy.act(base), atol=1e-5)
 
 
-def test_what_an_episode_keeps_does_not_grow_beyond_its_window() -> None:
-    policy = small()
+def test_what_an_episode_keeps_does_not_grow_beyond_its_window(policy: SimpleMemVlaPolicy) -> None:
     window = policy.require_processor().window
-    views, states = observations(400)
+    views, states = observations(240)
     episode: Any = policy.start_episode("pick up the cube")
     retained = []
-    for step in range(0, 400, 16):
+    for step in range(0, 240, 16):
         observe(episode, views, states, max(step - 15, 0), step + 1)
         policy.act(episode)
         while policy.prepare(episode):
@@ -121,8 +118,7 @@ def test_what_an_episode_keeps_does_not_grow_beyond_its_window() -> None:
     assert len({patches for _, patches in retained[-10:]}) == 1
 
 
-def test_a_full_window_that_moved_on_forgets_the_first_frame() -> None:
-    policy = small()
+def test_a_full_window_that_moved_on_forgets_the_first_frame(policy: SimpleMemVlaPolicy) -> None:
     span = policy.require_processor().window.span
     views, states = observations(span + 2)
     other = {name: view.copy() for name, view in views.items()}
@@ -137,8 +133,7 @@ def test_a_full_window_that_moved_on_forgets_the_first_frame() -> None:
     np.testing.assert_array_equal(chunks["views", span + 1], chunks["other", span + 1])
 
 
-def test_only_frames_of_the_video_need_to_be_rendered() -> None:
-    policy = small()
+def test_only_frames_of_the_video_need_to_be_rendered(policy: SimpleMemVlaPolicy) -> None:
     views, states = observations(60)
     read = policy.frames_read(np.array([59]), 0)
     assert read.tolist() == policy.require_processor().frames(59).tolist()
@@ -155,7 +150,7 @@ def test_only_frames_of_the_video_need_to_be_rendered() -> None:
 
 
 def test_without_video_the_past_does_not_count() -> None:
-    policy = small(processor={"max_words": 4, "video": False})
+    policy = small(**{"processor.video": False})
     views, states = observations(30)
     other = {name: np.concatenate([255 - view[:29], view[29:]]) for name, view in views.items()}
     chunks = []
@@ -167,26 +162,23 @@ def test_without_video_the_past_does_not_count() -> None:
     assert len(policy.frames_read(np.arange(30), 0)) == 0 and not policy.prepare(episode)
 
 
-def test_rows_of_a_batch_keep_their_temporal_patches() -> None:
-    policy = small()
+def test_rows_of_a_batch_keep_their_temporal_patches(policy: SimpleMemVlaPolicy) -> None:
     batch = policy.full_batch()
     assert torch.equal(batch.rows(torch.tensor([0, 0])).video[: len(batch.video)], batch.video)  # type: ignore[index, arg-type]
     assert batch.rows(slice(0, 1)).patches == batch.patches
 
 
 MEMORIES: dict[str, list[str]] = {
-    "framesamp": ["memory.grid=2", "memory.budget=8"],
     "tokendrop": ["memory.grid=2", "memory.budget=8"],
     "ttt": ["memory.grid=2", "memory.budget=8", "memory.max_steps=4", "memory.stride=1"],
-    "rmt": ["memory.grid=2", "memory.budget=8", "memory.max_steps=4", "memory.stride=1"],
 }
 
 
 @pytest.mark.parametrize("memory", MEMORIES)
 def test_a_memory_of_the_paper_in_the_videos_place(memory: str, tmp_path: Path) -> None:
     """It builds, trains two updates over the same backbone and head, and samples."""
-    words = [*WORDS, *RUN, f"memory={memory}", *MEMORIES[memory], "train.steps=2", "train.batch_size=2"]
-    checkpoint = run("simplememvla", tmp_path / "run", *words, short=[])
+    words = [*WORDS, f"memory={memory}", *MEMORIES[memory], "train.steps=2", "train.batch_size=2"]
+    checkpoint = run("simplememvla", tmp_path / "run", *words, short=UNTESTED)
     assert len(losses(tmp_path / "run")) == 2 and np.isfinite(losses(tmp_path / "run")).all()
     policy = Policy.from_pretrained(checkpoint)
     assert policy.config["name"].startswith(f"simplememvla_{memory}")
@@ -232,9 +224,9 @@ def test_a_language_model_without_delta_nets_generates() -> None:
 
 @pytest.mark.slow
 def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone(tmp_path: Path) -> None:
-    words = [*WORDS, *RUN, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
+    words = [*WORDS, "finetune=simplememvla", "train.steps=30", "train.batch_size=2", "train.lr=2e-3",
              "train.warmup=2"]  # fmt: skip
-    trained = Policy.from_pretrained(run("simplememvla", tmp_path / "run", *words, short=[]))
+    trained = Policy.from_pretrained(run("simplememvla", tmp_path / "run", *words, short=UNTESTED))
     values = losses(tmp_path / "run")
     assert len(values) == 30 and np.mean(values[-10:]) < 0.95 * np.mean(values[:10])
     fresh = dict(build_from_config(compose("train", ["model=simplememvla", *words])).named_parameters())
@@ -248,11 +240,10 @@ def test_a_lora_training_lowers_the_loss_and_changes_adapters_and_the_head_alone
     assert np.isfinite(trained.act(episode)).all()
 
 
-def test_the_recipe_has_two_learning_rates() -> None:
+def test_the_recipe_has_two_learning_rates(policy: SimpleMemVlaPolicy) -> None:
     cfg = compose("train", ["experiment=simplememvla"])
     assert cfg.name == "simplememvla" and cfg.backbone.horizon == 30 and cfg.embodiment.action.execute == 16
     settings = TrainSettings(steps=1, batch_size=1, lr=5e-5, part_lr={"vision": 0.1, "vlm": 0.1}, decay_min_dim=2)
-    policy = small()
     named = dict(policy.named_parameters())
     optimizer = make_optimizer(named.values(), settings, lr_factors(named, policy.finetune_spec, settings))
     factors = {id(p): group.get("lr_factor", 1.0) for group in optimizer.param_groups for p in group["params"]}
@@ -264,38 +255,28 @@ def test_the_recipe_has_two_learning_rates() -> None:
 
 def test_a_video_of_another_rate_is_refused() -> None:
     with pytest.raises(UserError, match=r"processor\.native_fps=15.*20 frames per second"):
-        build_policy("simplememvla", **{**SMALL, "processor": {"native_fps": 15}})
+        build_policy("simplememvla", **SMALL, **{"processor.native_fps": 15})
 
 
 def test_data_of_another_rate_are_refused(tmp_path: Path) -> None:
-    words = [*WORDS, *RUN, "embodiment.fps=10", "train.steps=1", "train.batch_size=1"]
+    words = [*WORDS, "embodiment.fps=10", "train.steps=1", "train.batch_size=1"]
     with pytest.raises(UserError, match=r"20 frames per second and embodiment\.fps=10"):
-        run("simplememvla", tmp_path / "run", *words, short=[])
+        run("simplememvla", tmp_path / "run", *words, short=UNTESTED)
 
 
-def test_it_acts_in_bfloat16(tmp_path: Path) -> None:
-    small().save_pretrained(tmp_path / "saved")
-    policy = Policy.from_pretrained(tmp_path / "saved", dtype="bfloat16")
-    views, states = observations(70)
-    episode = policy.start_episode("pick up the cube", seed=1)
-    observe(episode, views, states, 0, 50)
-    assert np.isfinite(policy.act(episode)).all()
-    policy.prepare(episode)  # type: ignore[operator]
-    observe(episode, views, states, 50, 66)
-    assert np.isfinite(policy.act(episode)).all()
-
-
-def test_inspect_names_its_parts(tmp_path: Path) -> None:
-    policy = small()
+def test_it_acts_in_bfloat16(policy: SimpleMemVlaPolicy, tmp_path: Path) -> None:
     policy.save_pretrained(tmp_path / "saved")
-    console = Console(record=True, width=200, file=io.StringIO())
-    show_checkpoint(tmp_path / "saved", console)
-    output = console.export_text()
-    assert all(word in output for word in ("simplememvla", "vision", "vlm", "action", "normalisation"))
+    rounded = Policy.from_pretrained(tmp_path / "saved", dtype="bfloat16")
+    views, states = observations(70)
+    episode = rounded.start_episode("pick up the cube", seed=1)
+    observe(episode, views, states, 0, 50)
+    assert np.isfinite(rounded.act(episode)).all()
+    rounded.prepare(episode)  # type: ignore[operator]
+    observe(episode, views, states, 50, 66)
+    assert np.isfinite(rounded.act(episode)).all()
 
 
-def test_a_policy_comes_back_from_its_folder(tmp_path: Path) -> None:
-    policy = small()
+def test_a_policy_comes_back_from_its_folder(policy: SimpleMemVlaPolicy, tmp_path: Path) -> None:
     policy.save_pretrained(tmp_path / "saved")
     again = Policy.from_pretrained(tmp_path / "saved")
     views, states = observations(25)

@@ -8,21 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.prior_vla_runs import losses, run
+from helpers.prior_vla_runs import UNTESTED, losses, run
 from mme_vla import UserError, build_policy
 from mme_vla.evaluation.rollouts import join
 from mme_vla.methods.simplememvla.subtask import SubtaskBatch, SubtaskPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.types import MemoryTokens
 
-RUN = ["logger=none", "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=0",
-       "train.open_loop_chunks=0", "data.val_episodes=[]", "train.batch_size=2"]  # fmt: skip
-
 
 @pytest.mark.parametrize("integration", ["modulator", "context"])
 def test_it_trains_two_updates_and_acts(integration: str, tmp_path: Path) -> None:
-    words = [*RUN, f"integration={integration}", "train.steps=2"]
-    policy = Policy.from_pretrained(run("pi05_subtask", tmp_path / "run", *words, short=[]))
+    words = [f"integration={integration}", "train.steps=2", "train.batch_size=2"]
+    policy = Policy.from_pretrained(run("pi05_subtask", tmp_path / "run", *words, short=UNTESTED))
     assert np.isfinite(losses(tmp_path / "run")).all() and isinstance(policy, SubtaskPolicy)
     episode = policy.start_episode("pick up the cube", seed=1)
     image = np.zeros((1, 64, 64, 3), np.uint8)

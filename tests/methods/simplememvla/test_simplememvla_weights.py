@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 
 pytest.importorskip("transformers", reason="needs the extra `vlm`: uv sync --inexact --extra vlm")
 
+from helpers.memory_fakes import same
 from mme_vla import UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.policy.base import Policy
@@ -45,8 +46,7 @@ def test_a_published_folder_is_written_and_read_again(published: Path, tmp_path:
     assert (config["history_video_sec"], config["action_horizon"], config["native_video_fps"]) == (60, 30, 20)
     policy, other = tiny(1), tiny(2)
     load_weights(other, published)
-    for name, tensor in policy.state_dict().items():
-        assert torch.equal(tensor, other.state_dict()[name]), name
+    assert same(policy, other)
     stats = read_stats(published)
     assert stats is not None and stats.state.mean.tolist() == policy.require_processor().stats.state.mean.tolist()  # type: ignore[union-attr]
     del tensors[LM_HEAD]
