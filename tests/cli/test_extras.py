@@ -68,7 +68,7 @@ SUFFICE = [
              "draws=2 moments=1 scan=false output=probed", "shuffle"),
     Case(("docs",), "mme_vla docs --build --output site", "index.html"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
-    Case(("harness",), "mme_vla harness --help", "flow_steps"),
+    Case(("harness",), "mme_vla harness --help", "--args.flow_steps"),
     Case(("orbax",), f"mme_vla weights {STEP} jax --to released", ""),
     Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
                          "train.open_loop_chunks=0 output=diffused", "checkpoint"),
@@ -134,7 +134,6 @@ def run(case: Case, folder: Path) -> tuple[int, str]:
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     with process:
-        assert process.stdout is not None
         printed = ""
         for line in process.stdout:
             printed += line

@@ -8,35 +8,29 @@ from hydra.errors import MissingConfigException
 from helpers import commands
 from mme_vla.config.override_errors import ConfigTree
 
-pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="launchers: uv sync --inexact --extra sweep")
-pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="launchers: uv sync --inexact --extra sweep")
-
 TINY = ("backbone=tiny", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
-def test_a_launcher_runs_every_job_of_a_sweep(launcher: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("launcher", "package", "words"),
+    [
+        ("joblib", "hydra_joblib_launcher", ()), ("submitit_local", "hydra_submitit_launcher", ()),
+        ("ray", "hydra_ray_launcher", ("+hydra.launcher.ray.init.num_cpus=1",)),
+    ],
+)  # fmt: skip
+def test_a_launcher_runs_every_job_of_a_sweep(
+    launcher: str, package: str, words: tuple[str, ...], tmp_path: Path
+) -> None:
+    pytest.importorskip(f"hydra_plugins.{package}", reason="launchers: uv sync --inexact --extra sweep")
     done = commands.run(
-        "mme_vla.probe", "--multirun", f"launcher={launcher}", "seed=7,42", "model=framesamp_modul", *TINY,
+        "mme_vla.probe", "--multirun", f"launcher={launcher}", *words, "seed=7,42", "model=framesamp_modul", *TINY,
         "recordings=sample", "recorded=1", "with=[shuffle]", "draws=2", "moments=1", "scan=false",
         f"output={tmp_path}/${{seed}}", f"hydra.sweep.dir={tmp_path}/sweep",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-3000:]
     probed = {seed: sorted(file.name for file in (tmp_path / seed).iterdir()) for seed in ("7", "42")}
     assert "table.md" in probed["7"] and probed["7"] == probed["42"]
-
-
-@pytest.mark.slow
-def test_ray_runs_every_job_of_a_sweep(tmp_path: Path) -> None:
-    pytest.importorskip("hydra_plugins.hydra_ray_launcher", reason="hydra-ray-launcher is not installed")
-    done = commands.run(
-        "mme_vla.probe", "--multirun", "launcher=ray", "+hydra.launcher.ray.init.num_cpus=1", "seed=7,42",
-        "model=framesamp_modul", *TINY, "recordings=sample", "recorded=1", "with=[shuffle]", "draws=2", "moments=1",
-        "scan=false", f"output={tmp_path}/${{seed}}", f"hydra.sweep.dir={tmp_path}/sweep",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert [(tmp_path / seed / "table.md").is_file() for seed in ("7", "42")] == [True, True]
 
 
 def test_a_launcher_that_is_not_installed_names_its_extra() -> None:

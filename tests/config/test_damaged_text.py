@@ -44,7 +44,7 @@ def test_an_endless_device_in_a_logs_place_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
-@pytest.mark.parametrize("damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "[", "[]", "null"])
+@pytest.mark.parametrize("damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "null"])
 def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog) -> None:
     artefacts.write_answers(tmp_path)
     cached = next((tmp_path / "answers").rglob("*.json"))

@@ -43,11 +43,12 @@ def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> 
     return ensure_cache(source, memory, encode, options.pop("encoder", "abc"), root=root, **options)
 
 
-@pytest.mark.parametrize("keep_every", [1, 4])
-@pytest.mark.parametrize("scored", [False, True])
-# In batches of other sizes MKL may add in another order.
-@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("bfloat16", 0)])
-def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype, tolerance) -> None:
+@pytest.mark.parametrize(
+    ("keep_every", "scored", "dtype"),
+    [(1, False, "float32"), (1, True, "float32"), (4, False, "bfloat16"), (4, True, "bfloat16")],
+)
+def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype) -> None:
+    tolerance = 1e-6 if dtype == "float32" else 0  # in batches of other sizes MKL may add in another order
     memory = LastFrames(keep_every=keep_every, scored=scored)
     cache = ensure(source, memory, tmp_path, dtype=dtype)
     assert cache.width == WIDTH

@@ -2,9 +2,7 @@
 
 import json
 import logging
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,19 +18,17 @@ from mme_vla.testing.small import small_policy
 
 VECTOR = {"dtype": "float32", "shape": (8,), "names": None}
 TEXT = {"dtype": "string", "shape": (1,), "names": None}
-SUBTASK = {"dtype": "int64", "shape": (1,), "names": None}
 LENGTHS, VIDEOS = (9, 7, 9), (4, 0, 2)
 
 
-@pytest.fixture
-def recordings(tmp_path: Path) -> Path:
-    folder = tmp_path / "h5"
-    folder.mkdir()
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("h5")
     write_file(folder / "record_dataset_Alpha.h5", LENGTHS, videos=VIDEOS, size=64)
     return folder
 
 
-def publish(root: Path, recordings: Path, image_format: str, more: Mapping[str, Any], order: tuple[int, ...]) -> Path:
+def publish(root: Path, recordings: Path, image_format: str, order: tuple[int, ...]) -> Path:
     """A dataset of these recordings in the published columns, at 10 frames per second, without demonstration flags."""
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -43,7 +39,7 @@ def publish(root: Path, recordings: Path, image_format: str, more: Mapping[str, 
     features = {"image": view, "wrist_image": view, "state": VECTOR, "actions": VECTOR, "simple_subgoal": TEXT}
     as_video = image_format == "video"
     dataset = LeRobotDataset.create(
-        "lerobot/robomme", 10, features | dict(more), root=root, robot_type="panda", use_videos=as_video,
+        "lerobot/robomme", 10, features, root=root, robot_type="panda", use_videos=as_video,
         video_backend="pyav",
         rgb_encoder=RGBEncoderConfig(vcodec="libsvtav1", crf=30, pix_fmt="yuv420p") if as_video else None,
     )  # fmt: skip
@@ -54,11 +50,31 @@ def publish(root: Path, recordings: Path, image_format: str, more: Mapping[str, 
                 dataset.add_frame({
                     "image": frame.front, "wrist_image": frame.wrist, "state": frame.state,
                     "actions": frame.action.astype(np.float32), "simple_subgoal": frame.subgoals["simple_subgoal"],
-                    **{name: np.array([1]) for name in more}, "task": episode.goals[0],
+                    "task": episode.goals[0],
                 })  # fmt: skip
         dataset.save_episode()
     dataset.finalize()
     return root
+
+
+@pytest.fixture(scope="module")
+def av1(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Episodes 2, 0 and 1 of the recordings, as videos."""
+    return publish(tmp_path_factory.mktemp("published") / "av1", recordings, "video", order=(2, 0, 1))
+
+
+@pytest.fixture(scope="module")
+def tables(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Episodes 1, 2 and 0 of the recordings, as images in the tables."""
+    return publish(tmp_path_factory.mktemp("published") / "tables", recordings, "image", order=(1, 2, 0))
+
+
+@pytest.fixture(scope="module")
+def ours(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recordings as this library converts them."""
+    folder = tmp_path_factory.mktemp("converted") / "ours"
+    convert(list_episodes(find_files([recordings])), folder, ConvertOptions(images="png"))
+    return folder
 
 
 def make_side_file(recordings: Path, dataset: Path, output: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -69,27 +85,25 @@ def make_side_file(recordings: Path, dataset: Path, output: Path, monkeypatch: p
 
 
 def test_videos_in_av1_without_flags_are_read_with_a_side_file(
-    tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, recordings: Path, av1: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = publish(tmp_path / "av1", recordings, "video", {}, order=(2, 0, 1))
     with pytest.raises(UserError, match="does not mark its conditioning videos"):
-        EpisodeSource(root)
-    starts = make_side_file(recordings, root, tmp_path / "starts.json", monkeypatch)
+        EpisodeSource(av1)
+    starts = make_side_file(recordings, av1, tmp_path / "starts.json", monkeypatch)
     assert json.loads(starts.read_text()) == {"0": 2, "1": 4, "2": 0}
-    source = EpisodeSource(root, exec_starts=starts)
+    source = EpisodeSource(av1, exec_starts=starts)
     assert source.exec_starts.tolist() == [2, 4, 0] and source.fps == 10
     assert source.frames(0, [0, 8]).shape == (2, 64, 64, 3)
     assert set(source.lossy) == {"front", "wrist"} and source.lossy["front"].startswith("av1")
     with pytest.raises(SystemExit):
-        make_side_file(recordings, root, starts, monkeypatch)
+        make_side_file(recordings, av1, starts, monkeypatch)
 
 
 def test_a_memory_that_scores_patches_is_warned_of_lossy_videos(
-    tmp_path: Path, recordings: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, av1: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    root = publish(tmp_path / "av1", recordings, "video", {}, order=(1,))
-    (tmp_path / "starts.json").write_text('{"0": 0}')
-    source = EpisodeSource(root, exec_starts=tmp_path / "starts.json")
+    (tmp_path / "starts.json").write_text('{"0": 2, "1": 4, "2": 0}')
+    source = EpisodeSource(av1, exec_starts=tmp_path / "starts.json")
     for model, warned in (("tokendrop_modul", True), ("framesamp_modul", False)):
         caplog.clear()
         policy = small_policy(model)
@@ -98,24 +112,18 @@ def test_a_memory_that_scores_patches_is_warned_of_lossy_videos(
         assert ("passes for motion" in caplog.text) == warned
 
 
-def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, recordings: Path) -> None:
-    root = publish(tmp_path / "tables", recordings, "image", {}, order=(0, 1, 2))
-    (tmp_path / "starts.json").write_text('{"0": 4, "1": 0, "2": 2}')
-    source = EpisodeSource(root, exec_starts=tmp_path / "starts.json")
+def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, tables: Path, ours: Path) -> None:
+    (tmp_path / "starts.json").write_text('{"0": 0, "1": 2, "2": 4}')
+    source = EpisodeSource(tables, exec_starts=tmp_path / "starts.json")
     assert source.video_cameras == () and source.lossy == {}
-    convert(list_episodes(find_files([recordings])), tmp_path / "ours", ConvertOptions(images="png"))
-    converted = EpisodeSource(tmp_path / "ours")
-    np.testing.assert_array_equal(source.frames(2, range(9), "wrist"), converted.frames(2, range(9), "wrist"))
+    converted = EpisodeSource(ours)
+    np.testing.assert_array_equal(source.frames(1, range(9), "wrist"), converted.frames(2, range(9), "wrist"))
 
 
 def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_named(
-    tmp_path: Path, recordings: Path
+    tmp_path: Path, tables: Path, ours: Path
 ) -> None:
-    convert(list_episodes(find_files([recordings])), tmp_path / "ours", ConvertOptions(images="png"))
-    root = publish(tmp_path / "tables", recordings, "image", {}, order=(1, 2, 0))
-    assert first_frames(root, annotated_episodes([tmp_path / "ours"])) == [0, 2, 4]
-    others = tmp_path / "others"
-    others.mkdir()
-    write_file(others / "record_dataset_AnotherSeed.h5", LENGTHS, videos=VIDEOS, size=16)
+    assert first_frames(tables, annotated_episodes([ours])) == [0, 2, 4]
+    write_file(tmp_path / "record_dataset_AnotherSeed.h5", LENGTHS, videos=VIDEOS, size=16)
     with pytest.raises(UserError, match=r"episode 0 .*is not among the 3 episodes given: the nearest is .* rad"):
-        first_frames(root, annotated_episodes([others]))
+        first_frames(tables, annotated_episodes([tmp_path]))

@@ -1,4 +1,4 @@
-"""Each of the 17 models trains on the embedded sample as `python -m mme_vla.train` does; recurrent ones resume."""
+"""Each model trains on the embedded sample as `python -m mme_vla.train` does."""
 
 import time
 from pathlib import Path
@@ -6,18 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
-from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
 from mme_vla.training.logging import read_metrics
 
 pytestmark = pytest.mark.slow
 
-STEPS, WINDOW = 30, 6
+STEPS, WINDOW = 24, 6
 SMALL = [
     "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2",
     "backbone.vision.width=16", "backbone.vision.mlp_dim=16", "policy.augment=false", "logger=none",
@@ -49,16 +47,12 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("caches")
 
 
-def run(model: str, folder: Path, caches: Path, *overrides: str) -> Path:
-    """Train in this process; the last checkpoint."""
+def run(model: str, folder: Path, caches: Path, *overrides: str) -> None:
+    """Train in this process."""
     memory = SHORT_MEMORY[model.rsplit("_", 1)[0]] if model in [*NEURAL, *BEYOND, "hybrid"] else []
     cfg = compose("train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides])
     config: Any = OmegaConf.to_container(cfg, resolve=True)
-    return train(cfg, config, folder, begun=time.perf_counter())
-
-
-def losses(folder: Path) -> list[float]:
-    return [line["train/loss"] for line in read_metrics(folder) if "train/loss" in line]
+    train(cfg, config, folder, begun=time.perf_counter())
 
 
 @pytest.mark.parametrize("model", [*ALL_MODELS, *BEYOND])
@@ -67,20 +61,8 @@ def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Pa
     lines = read_metrics(tmp_path)
     numbers = [value for line in lines for value in line.values()]
     assert np.isfinite(numbers).all()
-    loss = losses(tmp_path)
+    loss = [line["train/loss"] for line in lines if "train/loss" in line]
     assert len(loss) == STEPS
     assert np.mean(loss[-WINDOW:]) < 0.6 * np.mean(loss[:WINDOW])
     reported = {key for key in lines[-1] if key.startswith(("train/memory/", "memory/")) and key != "memory/gib"}
     assert bool(reported) == (model in RECURRENT), "recurrent memories report what happens inside them"
-
-
-def test_a_recurrent_model_resumes_where_it_stopped(tmp_path: Path, caches: Path) -> None:
-    straight = run("ttt_modul", tmp_path / "whole", caches, "train.steps=12")
-    parts = tmp_path / "parts"
-    run("ttt_modul", parts, caches, "train.steps=6")
-    resumed = run("ttt_modul", tmp_path / "unused", caches, "train.steps=12", f"resume={parts}")
-    assert losses(parts) == losses(tmp_path / "whole")
-    assert len(losses(parts)) == 12
-    after = load_tensors(resumed)
-    for name, tensor in load_tensors(straight).items():
-        assert torch.equal(tensor, after[name]), name

@@ -12,10 +12,7 @@ from typing import Any
 import pytest
 
 from helpers import REPOSITORY
-from mme_vla.envs.rendering import render_backend
-from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
-from mme_vla.testing import check_memory
 
 EXAMPLE = REPOSITORY / "examples" / "first_hour"
 PAGE = REPOSITORY / "docs" / "start" / "first-hour.md"
@@ -57,19 +54,13 @@ def shell(command: str) -> None:
     assert done.returncode == 0, done.stdout
 
 
-def require_rendering() -> None:
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
-    try:
-        render_backend()
-    except UserError as error:
-        pytest.skip(f"cannot render here: {error}")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
-def test_the_cells_of_a_notebook_run(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_cells_of_a_notebook_run(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     if name != "01_train.ipynb":
-        require_rendering()
+        request.getfixturevalue("renderer")
     copytree(EXAMPLE, tmp_path / "folder", ignore=ignore_patterns("outputs"))
     monkeypatch.chdir(tmp_path / "folder")
     monkeypatch.setenv("MPLBACKEND", "agg")
@@ -90,23 +81,10 @@ def test_a_notebook_keeps_the_outputs_of_a_full_run(name: str) -> None:
     assert (EXAMPLE / name).stat().st_size < 1_000_000
 
 
-def test_each_setting_is_one_of_its_notebook() -> None:
-    for name, settings in SETTINGS.items():
-        first = "".join(code_cells(name)[0]["source"])
-        assert all(f"\n{key} = " in f"\n{first}" for key in settings), name
-
-
 def test_the_page_shows_the_files_of_the_example() -> None:
     page = PAGE.read_text()
     for file in ("video_frames.py", "configs/model/video_frames_modul.yaml"):
         assert (EXAMPLE / file).read_text().strip() in page, file
-
-
-def test_the_memory_of_the_page_passes_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(EXAMPLE)
-    import video_frames  # noqa: F401
-
-    check_memory("video_frames", budget=4, grid=1)
 
 
 def shortest_path() -> list[str]:
@@ -116,8 +94,8 @@ def shortest_path() -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("renderer")
 def test_the_shortest_path_leads_to_a_memory_in_closed_loop(tmp_path: Path) -> None:
-    require_rendering()
     unneeded = ignore_patterns(".*", "__pycache__", "outputs", "tests", "docs", "*.egg-info")
     clone = copytree(REPOSITORY, tmp_path / "clone", ignore=unneeded)
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -134,11 +112,3 @@ def test_the_shortest_path_leads_to_a_memory_in_closed_loop(tmp_path: Path) -> N
     solved = {record.model.partition("-")[0] for record in records if record.success}
     assert "pi05" not in solved, "a policy without memory cannot know the container"
     assert "| video_frames_modul | 4 |" in (output / "page.md").read_text()
-
-
-def test_the_times_of_the_shortest_path_add_up() -> None:
-    section = PAGE.read_text().partition("## The shortest path")[2]
-    rows = {cells[0].strip(): cells[1] for line in section.splitlines() if (cells := line.split("|")[1:-1])}
-    parts = ["check", "40 demonstrations", "training, with and without memory", "evaluation, four episodes each"]
-    seconds = sum(int(number) for part in parts for number in re.findall(r"\d+", rows[part]))
-    assert abs(seconds - int(rows["in all, from the check on"])) <= 20

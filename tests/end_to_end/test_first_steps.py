@@ -30,8 +30,6 @@ def test_latest_is_the_run_that_wrote_a_checkpoint_last(tmp_path: Path) -> None:
         os.utime(step, (1000 + age, 1000 + age))
     assert find_run(tmp_path / "latest") == tmp_path / "a"
     assert resolve_checkpoint(tmp_path / "latest") == tmp_path / "a" / "checkpoints" / "step_000010"
-    with pytest.raises(UserError, match="No run with a checkpoint in"):
-        resolve_checkpoint(tmp_path / "a" / "latest")
 
 
 def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
@@ -53,8 +51,6 @@ def test_the_average_of_nothing_but_failures_has_an_interval(won: bool) -> None:
     ]
     figures = aggregate(records, Protocol(("BinFill", "StopCube"), 2)).methods[0].figures
     average, task = figures["average"]["average"].interval, figures["task"]["BinFill"].interval
-    assert average is not None
-    assert task is not None
     assert 30 < average.high - average.low < task.high - task.low
 
 

@@ -9,7 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from mme_vla import UserError, build_policy
+from helpers.probe_fakes import MadeUpSource
+from helpers.rollout_fakes import quick_policy
+from mme_vla import UserError
 from mme_vla.backbone import gemma
 from mme_vla.cli.analyse import main
 from mme_vla.data.episodes import EpisodeSource
@@ -17,16 +19,12 @@ from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.evaluation.analyses.replay import recurrence_curves, recurrence_plot, replay
 from mme_vla.evaluation.analyses.watches import AttentionWatch, ModulationWatch
 from mme_vla.evaluation.results.paper import counted
-from mme_vla.testing.small import random_batch, small_policy, unit_stats
+from mme_vla.testing.small import random_batch, small_policy
 
 
 @pytest.fixture(scope="module")
 def sample() -> EpisodeSource:
     return EpisodeSource("sample")
-
-
-FEW_TOKENS = {"vision.patch_size": 14}
-"""8×8 tokens a view, where whole episodes are encoded."""
 
 
 def fixed_noise() -> Tensor:
@@ -110,28 +108,23 @@ def test_wrong_policies_are_named() -> None:
         count_model("pi05", 64, "tiny")
 
 
-def test_a_replay_shows_every_frame_once(sample: EpisodeSource) -> None:
-    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
-    observed = [(step, running.n_observed_frames) for step, running in replay(policy, sample, 0, stride=32)]
-    start = int(sample.exec_starts[0])
-    assert observed == [(step, step + 1) for step in range(start, int(sample.lengths[0]), 32)]
-    assert [step for step, _ in replay(policy, sample, 0, stride=32, most=2)] == [observed[0][0], observed[-1][0]]
-    with pytest.raises(UserError, match="has episodes 0 … 3"):
-        next(replay(policy, sample, 4))
+def test_a_replay_shows_every_frame_once() -> None:
+    policy, source = quick_policy("framesamp_modul"), MadeUpSource(lengths=(60,), video=20)
+    observed = [(step, running.n_observed_frames) for step, running in replay(policy, source, 0, stride=16)]
+    assert observed == [(20, 21), (36, 37), (52, 53)]
+    assert [step for step, _ in replay(policy, source, 0, stride=16, most=2)] == [20, 52]
+    with pytest.raises(UserError, match="has episodes 0 … 0"):
+        next(replay(policy, source, 1))
 
 
 def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSource) -> None:
-    policy = build_policy("ttt_modul", backbone=FEW_TOKENS)
-    policy.require_processor().stats = unit_stats()
-    curves = recurrence_curves(policy, sample, 1)
+    curves = recurrence_curves(quick_policy("ttt_modul", 8), sample, 1)
     before, after = curves.curves["inner_loss_before"], curves.curves["inner_loss_after"]
     assert len(before) == len(curves.frames)
     assert (after < before).mean() > 0.9
     assert before[-1] < before[0]
     assert recurrence_plot([curves], "ttt").startswith("<svg")
-    other = build_policy("rmt_expert", backbone=FEW_TOKENS)
-    other.require_processor().stats = unit_stats()
-    assert set(recurrence_curves(other, sample, 1).curves) == {"slot_change"}
+    assert set(recurrence_curves(quick_policy("rmt_expert", 8), MadeUpSource(), 1).curves) == {"slot_change"}
     with pytest.raises(UserError, match="no recurrent memory"):
         recurrence_curves(small_policy("pi05"), sample, 1)
 
@@ -159,8 +152,7 @@ def test_a_smaller_memory_costs_less_and_a_stream_less_than_a_window(tmp_path: P
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["attention"], "Name one policy"), (["cost", "--models", "framesamp"], "Did you mean"),
-     (["modulation", "--model", "pi05", "--most", "1"], "no modulator")],
+    [(["attention"], "Name one policy"), (["cost", "--models", "framesamp"], "Did you mean")],
 )  # fmt: skip
 def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -22,11 +22,10 @@ from mme_vla.utils import write_json
 JOBS = [Job("BinFill", "test", i) for i in range(4)]
 
 TAKE_TWO = """
-import os, signal, sys
+import sys
 from pathlib import Path
 from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.store import Claims
-from mme_vla.evaluation.store import RecordLog
+from mme_vla.evaluation.store import Claims, RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
 folder = Path(sys.argv[1])
 log = RecordLog(folder / "episodes-0of2.jsonl")
@@ -61,7 +60,6 @@ def test_unfinished_episodes_of_a_killed_process_are_taken_again(tmp_path: Path)
     process = subprocess.Popen(
         [sys.executable, "-c", TAKE_TWO, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == "taken\n"
     other = "episodes-1of2.jsonl"
     with RecordLog(tmp_path / other):
@@ -143,11 +141,11 @@ def test_episodes_that_took_longest_begin_first() -> None:
 def test_the_forecast_follows_whoever_is_slower() -> None:
     durations = Durations([record(0, 3600)])
     alone = durations.forecast(JOBS, workers=1)
-    assert alone is not None and alone.seconds == pytest.approx(4 * 0.75 * 3600)
+    assert alone.seconds == pytest.approx(4 * 0.75 * 3600)
     many = durations.forecast(JOBS, workers=4)
-    assert many is not None and many.seconds == pytest.approx(3600)  # the policy's quarter of each, one by one
+    assert many.seconds == pytest.approx(3600)  # the policy's quarter of each, one by one
     shared = durations.forecast(JOBS * 10, workers=4, processes=2)
-    assert shared is not None and shared.seconds == pytest.approx(5 * 3600)
+    assert shared.seconds == pytest.approx(5 * 3600)
     assert str(shared) == (
         "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1 before them did"
     )
@@ -156,9 +154,7 @@ def test_the_forecast_follows_whoever_is_slower() -> None:
 
 def test_an_episode_that_is_tried_again_comes_last() -> None:
     waiting = Waiting(JOBS[:2])
-    first = waiting.take()
-    assert first is not None
-    waiting.put_back(first)
+    waiting.put_back(waiting.take())
     assert [taken(waiting.take()) for _ in range(3)] == [1, 0, None]
 
 

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, records, roll
+from helpers.rollout_fakes import (
+    FACTS,
+    JOBS,
+    InlineEnvs,
+    quick_policy,
+    records,
+    roll,
+    save_records,
+    use_inline_envs,
+)
 from helpers.scripted_env import VIDEO, make_moving_env, make_slow_env
 from mme_vla import MMEPolicy, UserError, build_policy, register
 from mme_vla.cli.results import main as results
@@ -25,7 +34,6 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.rollout.evaluation import evaluate_events
 from mme_vla.evaluation.rollout.events import Event, EventCourse, event_arms, read_events
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import RecordLog
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.processing.normalise import NormStats
 from mme_vla.registry import EVENTS
@@ -136,9 +144,8 @@ def test_frames_of_a_gap_are_not_observed(policy: MMEPolicy, monkeypatch: pytest
         assert torch.allclose(selection.features, offline.features, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["framesamp_modul", "tokendrop_expert"])
-def test_images_on_demand_are_all_that_a_policy_reads_under_events(name: str) -> None:
-    policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
+def test_images_on_demand_are_all_that_a_policy_reads_under_events() -> None:
+    policy = quick_policy("tokendrop_expert", 8, policy={"history_dtype": "float32"})
     event = "pause:5@step:16+gap:4@step:16+speed:2"
     few, every = (roll(policy, [UNMASK], InlineEnvs(), event=event, draw=draw)[0] for draw in ("needed", "all"))
     assert facts(few) == facts(every) and few.steps == 51
@@ -251,7 +258,10 @@ def test_a_custom_environment_names_the_action_that_keeps_its_robot() -> None:
         RolloutSettings(env="official", event="gap:5")
 
 
-def test_every_event_run_has_its_matched_arm(memoryless: MMEPolicy, tmp_path: Path) -> None:
+def test_every_event_run_has_its_matched_arm(
+    memoryless: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_inline_envs(monkeypatch)
     settings = RolloutSettings(max_steps=24, flow_steps=2, workers=2, max_batch=1)
     jobs, how = JOBS[2:4], {"base": make_slow_env, "show_progress": False}
     done = evaluate_events(memoryless, jobs, tmp_path, FACTS, settings, ["pause:9@subtask:30", "pause:9"], **how)
@@ -287,9 +297,7 @@ def test_results_pair_events_with_their_matched_arms(tmp_path: Path, capsys: pyt
     assert {(first.event, second.event) for first, second in pairs} == {
         (event, None) for event in ("pause:50", "pause:100", "speed:2", "pause:50@subtask:9")
     }
-    with RecordLog(tmp_path / "episodes.jsonl") as log:
-        for record in made:
-            log.append(record)
+    save_records(tmp_path, made)
     page = tmp_path / "page.html"
     results([str(tmp_path), "--events", "--html", str(page)])
     assert "Events beside their matched arms" in capsys.readouterr().out and "PickXtimes, pause" in page.read_text()
@@ -324,7 +332,6 @@ def test_a_robot_that_chooses_stands_still_before_its_next_motion_in_a_sub_task(
     built = build_policy(
         "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", memory={"budget": 4, "grid": 1}
     )
-    assert isinstance(built, MMEPolicy)
     built.require_processor().stats = NormStats.unit(8, 10)
     holds: list[tuple[int, int, float]] = []
     hold = RoboMMEEnv._hold

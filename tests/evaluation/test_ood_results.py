@@ -7,13 +7,13 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="amounts come from scenes, which need the extra 'sim'")
 
+from helpers.rollout_fakes import save_records
 from mme_vla.cli.results import main
 from mme_vla.envs import metadata
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results import ood
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.store import RecordLog
 
 
 def made(task: str, split: str, wins: Sequence[int], model: str = "m", year: int = 2026) -> list[EpisodeRecord]:
@@ -76,9 +76,7 @@ def test_the_papers_figures_do_not_stand_beside_other_episodes() -> None:
 
 
 def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RecordLog(tmp_path / "episodes.jsonl") as log:
-        for record in made("PatternLock", "ood", [1, 0]) + made("PatternLock", "hard", [1, 0]):
-            log.append(record)
+    save_records(tmp_path, made("PatternLock", "ood", [1, 0]) + made("PatternLock", "hard", [1, 0]))
     page, text = tmp_path / "page.html", tmp_path / "page.md"
     main([str(tmp_path), "--ood", "--html", str(page), "--markdown", str(text)])
     visible = capsys.readouterr().out
@@ -87,14 +85,10 @@ def test_the_command_writes_the_tables(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_records_without_a_table_of_this_kind_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RecordLog(tmp_path / "episodes.jsonl") as log:
-        for record in made("MoveCube", "ood", [1, 0]):
-            log.append(record)
+    save_records(tmp_path, made("MoveCube", "ood", [1, 0]))
     main([str(tmp_path), "--ood"])
     assert "Extrapolation" not in capsys.readouterr().out, "nothing grows in MoveCube"
-    with RecordLog(tmp_path / "plain" / "episodes.jsonl") as log:
-        for record in made("MoveCube", "test", [1, 0]):
-            log.append(record)
+    save_records(tmp_path / "plain", made("MoveCube", "test", [1, 0]))
     with pytest.raises(SystemExit):
         main([str(tmp_path / "plain"), "--ood"])
     assert "None of these records is of RoboMME-OOD" in capsys.readouterr().err
@@ -105,8 +99,7 @@ def test_records_without_a_table_of_this_kind_are_refused(tmp_path: Path, capsys
     [("--ood --stress", "--stress and --ood: name one"), ("--ood --csv t.csv", "--csv: not with --ood")],
 )
 def test_views_exclude_each_other(words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with RecordLog(tmp_path / "episodes.jsonl") as log:
-        log.append(made("PatternLock", "ood", [1])[0])
+    save_records(tmp_path, made("PatternLock", "ood", [1]))
     with pytest.raises(SystemExit):
         main([str(tmp_path), *words.split()])
     assert message in capsys.readouterr().err

@@ -8,22 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.rollout_fakes import save_records
 from mme_vla import UserError
 from mme_vla.cli.results import main
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import (
-    Results,
-    aggregate,
-    bootstrap,
-    wilson,
-)
+from mme_vla.evaluation.results.aggregate import Results, aggregate, bootstrap, wilson
 from mme_vla.evaluation.results.compare import compare, compare_all, holm, sign_test
 from mme_vla.evaluation.results.paper import demo_records
 from mme_vla.evaluation.results.report import policy_facts, training_details
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS, Protocol, tasks_of
 from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
-from mme_vla.evaluation.store import RecordLog, claim_run
+from mme_vla.evaluation.store import claim_run
 
 # Where the paper's suite and group tables differ from the means of its own per-task table.
 MISPRINTS = {("pi_0.5", "Short-Horizon Video Reasoning"), ("RMT+Expert", "Reference"), ("RMT+Expert", "average"),
@@ -250,10 +246,9 @@ def test_csv_holds_the_figures_and_latex_escapes(demo: Results) -> None:
 def test_the_command_reads_shards_and_saves_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     for shard in range(2):
-        with RecordLog(run / f"episodes-{shard}.jsonl") as log:
-            for name, wins in (("pi05", [1, 0, 0, 0]), ("ttt_modul", [1, 1, 0, 1])):
-                for made in records(name, {"BinFill": wins, "MoveCube": wins})[shard::2]:
-                    log.append(made)
+        for name, wins in (("pi05", [1, 0, 0, 0]), ("ttt_modul", [1, 1, 0, 1])):
+            made = records(name, {"BinFill": wins, "MoveCube": wins})
+            save_records(run / f"episodes-{shard}.jsonl", made[shard::2])
     files = {kind: tmp_path / "out" / f"results.{kind}" for kind in ("csv", "latex", "markdown", "html")}
     options = [part for kind, path in files.items() for part in (f"--{kind}", str(path))]
     main([str(run), "--tasks", "BinFill", "MoveCube", "--episodes", "4", "--samples", "50", *options])
@@ -273,10 +268,7 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
               "card": {"data": "robomme", "recipe": {"steps": 80000, "batch_size": 64, "lr": 5e-5}}}  # fmt: skip
     claim_run(tmp_path / "a", {"model": "ttt_expert", "checkpoint": 100}, {"policy": policy_facts(config)})
     for folder, name in (("a", "ttt_expert"), ("b", "pi05")):
-        with RecordLog(tmp_path / folder / "episodes.jsonl") as log:
-            for seed in (7, 42):
-                for made in records(name, wins, seed):
-                    log.append(made)
+        save_records(tmp_path / folder, [*records(name, wins, seed=7), *records(name, wins, seed=42)])
     out = tmp_path / "out.md"
     options = ["--tasks", "BinFill", "MoveCube", "--episodes", "2", "--samples", "50", "--brief", "--markdown"]
     main([str(tmp_path / "a"), str(tmp_path / "b"), *options, str(out)])
@@ -304,9 +296,7 @@ def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys
 def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with RecordLog(tmp_path / "episodes.jsonl") as log:
-        for made in [*records("pi05", {"BinFill": [1, 0]}), *records("ttt_modul", {"MoveCube": [1, 1]})]:
-            log.append(made)
+    save_records(tmp_path, [*records("pi05", {"BinFill": [1, 0]}), *records("ttt_modul", {"MoveCube": [1, 1]})])
     options = [str(tmp_path), "--tasks", "BinFill", "MoveCube", "--episodes", "2", "--samples", "20", "--brief"]
     main(options)
     printed = capsys.readouterr().out
@@ -340,9 +330,7 @@ def test_escape_sequences_of_names_do_not_reach_the_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for i, name in enumerate((f"a{HOSTILE}", f"b{HOSTILE}")):
-        with RecordLog(tmp_path / f"episodes-{i}.jsonl") as log:
-            for record in records(name, {"BinFill": [True, False]}):
-                log.append(record)
+        save_records(tmp_path / f"episodes-{i}.jsonl", records(name, {"BinFill": [True, False]}))
     main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2"])
     assert "\\x1b[2J" in (printed := capsys.readouterr().out)
     assert "\x1b" not in printed and "\x07" not in printed
@@ -380,8 +368,6 @@ def test_a_name_is_no_link_and_no_html_of_markdown(name: str, displayed: str) ->
 
 
 def test_a_name_with_dollar_signs_is_text_in_the_figures(tmp_path: Path) -> None:
-    with RecordLog(tmp_path / "episodes.jsonl") as log:
-        for record in records(r"$\nonsense$", {"BinFill": [True, False]}):
-            log.append(record)
+    save_records(tmp_path, records(r"$\nonsense$", {"BinFill": [True, False]}))
     main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2", "--html", str(tmp_path / "page.html"), "--brief"])
     assert r"$\nonsense$" in (tmp_path / "page.html").read_text()

@@ -5,40 +5,18 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from helpers import commands
-from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation
+from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation, use_inline_envs
 from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import (
-    Shard,
-    choose_shard,
-)
+from mme_vla.evaluation.rollout.evaluation import Shard, choose_shard, evaluate
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import Claims, find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import random_batch
-
-TESTS = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy after two updates, saved."""
-    policy = quick_policy("framesamp_modul", memory={"budget": 64})
-    optimizer = torch.optim.AdamW(policy.parameters(), 1e-3)
-    policy.train()
-    for step in range(2):
-        optimizer.zero_grad()
-        policy(random_batch(policy, 1, seed=step))[0].backward()
-        optimizer.step()
-    folder = tmp_path_factory.mktemp("policy") / "step_000003"
-    policy.eval().save_pretrained(folder)
-    return folder
 
 
 def outcomes(folder: Path) -> dict:
@@ -48,8 +26,11 @@ def outcomes(folder: Path) -> dict:
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp_path: Path) -> None:
-    policy = MMEPolicy.from_pretrained(str(checkpoint))
+def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_inline_envs(monkeypatch)  # the killed run has worker processes
+    checkpoint = tmp_path / "step_000003"
+    quick_policy("framesamp_modul", memory={"budget": 64}).save_pretrained(checkpoint)
+    policy = MMEPolicy.from_pretrained(checkpoint)
     straight = run_evaluation(policy, tmp_path / "whole")
     assert len(straight.records) == len(JOBS) == 6
     assert len({record.outcome for record in straight.records}) > 1, "the episodes should differ"
@@ -98,9 +79,7 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(tmp_path: Path, monkeypa
 
 
 def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.evaluation.rollout.evaluation as module
-
-    monkeypatch.setattr(module, "VecEnv", inline)
+    use_inline_envs(monkeypatch)
     run_evaluation(quick_policy("pi05"), tmp_path, jobs=JOBS[:1])
     with pytest.raises(UserError, match=r"execute was 16, is 8"):
         run_evaluation(quick_policy("pi05"), tmp_path, execute=8)
@@ -109,30 +88,20 @@ def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monke
 
 
 def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.evaluation.rollout.evaluation as module
-
-    monkeypatch.setattr(module, "VecEnv", inline)
-    policy = quick_policy("pi05")
-    settings = RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
-    for folder in (tmp_path / "runs" / "seed7", tmp_path / "runs"):  # the second lies above the first
-        done = module.evaluate(policy, JOBS[:1], folder, FACTS, settings, base=make_moving_env, show_progress=False)
+    use_inline_envs(monkeypatch)
+    policy, runs = quick_policy("pi05"), tmp_path / "runs"
+    for folder in (runs / "seed7", runs):  # the second lies above the first
+        done = run_evaluation(policy, folder, jobs=JOBS[:1])
         assert done.workload.batches > 0 and len(done.records) == 1
-    foreign = tmp_path / "runs" / "episodes-foreign.jsonl"
     other = EpisodeRecord("tiny", "untrained", 7, "PickXtimes", 1, 1, "easy", "success", 5)
-    foreign.write_text(other.to_json() + "\n")
-    done = module.evaluate(
-        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_moving_env, show_progress=False
-    )
+    (runs / "episodes-foreign.jsonl").write_text(other.to_json() + "\n")
+    done = run_evaluation(policy, runs, jobs=JOBS[:2])
     assert done.workload.batches > 0 and {record.model_seed for record in done.records} == {42}
-    assert module.evaluate(
-        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_moving_env, show_progress=False
-    ).workload.batches == 0  # fmt: skip
+    assert run_evaluation(policy, runs, jobs=JOBS[:2]).workload.batches == 0
 
 
 def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.evaluation.rollout.evaluation as module
-
-    monkeypatch.setattr(module, "VecEnv", inline)
+    use_inline_envs(monkeypatch)
     policy, settings = quick_policy("pi05"), RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
     left = [2, 2]  # how many the first process may begin; the other does the rest
     take = Claims.take
@@ -145,7 +114,7 @@ def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(Claims, "take", at_most)
     for index in range(2):
         shard = Shard(index, 2)
-        mine = module.evaluate(
+        mine = evaluate(
             policy, JOBS[:4], tmp_path, FACTS, settings, shard=shard, base=make_moving_env, show_progress=False
         )
         assert len(mine.records) == 2
@@ -153,17 +122,6 @@ def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pyte
     both = outcomes(tmp_path)
     run_evaluation(policy, tmp_path / "alone", make_moving_env, jobs=JOBS[:4])
     assert both == outcomes(tmp_path / "alone")
-
-
-def inline(jobs, workers, factory, options, timeout):
-    class Inline(InlineEnvs):
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-    return Inline(workers, **options)
 
 
 def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:

@@ -32,7 +32,6 @@ def policy() -> MMEPolicy:
     built = build_policy(
         "framesamp_modul", backbone="nano_choice", embodiment="robomme_choice_front", memory={"budget": 4, "grid": 1}
     )
-    assert isinstance(built, MMEPolicy)
     built.require_processor().stats = NormStats.unit(8, 10)
     return built.eval()
 
@@ -42,7 +41,6 @@ def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choice
     assert [t.job for t in trajectories] == JOBS
     for number, trajectory in enumerate(trajectories):
         rows = trajectory.observations
-        assert rows is not None and rows.actions is not None and trajectory.log_probs is not None
         (executed,) = trajectory.actions
         assert executed.shape == (1, 10)
         right = int(executed[0].argmax()) == number % 2
@@ -51,7 +49,6 @@ def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choice
         assert rows.action_mask is not None and rows.action_mask.tolist() == [[True, False, False, False]]
         assert rows.options is not None and rows.options.tolist() == [[True, True, *[False] * 6]]
         assert torch.allclose(log_prob(policy, rows, trajectory.chunks), trajectory.log_probs, atol=1e-5)
-        assert trajectory.oracle is not None and trajectory.oracle.actions is not None
         assert int(trajectory.oracle.actions[0, 0, :8].argmax()) == number % 2
     batch = join([t.observations for t in trajectories if t.observations is not None])
     loss, _ = policy(batch)
@@ -60,7 +57,6 @@ def test_a_trajectory_holds_rows_rewards_and_the_log_probabilities_of_its_choice
 
 def test_rows_are_joined_with_their_weights_and_labels(policy: MMEPolicy) -> None:
     one, two = (t.observations for t in rollouts(policy, two_choices, JOBS[:2], ("observations",)))
-    assert one is not None and two is not None
     labelled = [
         replace(one, weight=torch.tensor([0.5]), labels=Labels(grasp=torch.tensor([1.0]))),
         replace(two, action_mask=None, labels=Labels(grasp=torch.tensor([2.0]))),
@@ -119,11 +115,9 @@ def test_paths_of_a_flow_are_kept_with_their_log_probabilities() -> None:
         "pi05", backbone="nano", embodiment="robomme_choice_front",
         **{"backbone.action_dim": 10, "+backbone.head.deviation": 0.1},
     )  # fmt: skip
-    assert isinstance(built, MMEPolicy)
     built.require_processor().stats = NormStats.unit(8, 10)
     (trajectory,) = rollouts(built.eval(), two_choices, JOBS[:1], ("observations", "log_probs"))
     paths = trajectory.paths
-    assert paths is not None and trajectory.log_probs is not None and trajectory.observations is not None
     assert paths.shape == (1, 11, 4, 10) and torch.equal(paths[:, -1], trajectory.chunks)
     again = path_log_prob(built, trajectory.observations, SamplePath(paths, 0.1, None))
     assert torch.allclose(again, trajectory.log_probs, rtol=1e-5)
@@ -139,7 +133,6 @@ def test_what_cannot_be_kept_is_refused(policy: MMEPolicy) -> None:
     with pytest.raises(UserError, match="Unknown reward 'dense'"):
         next(rollouts(policy, "mme_vla", JOBS, reward="dense"))
     joints = build_policy("pi05", backbone="nano")
-    assert isinstance(joints, MMEPolicy)
     with pytest.raises(UserError, match="samples without a density"):
         next(rollouts(joints, two_choices, JOBS, ("log_probs",)))
     with pytest.raises(UserError, match="chooses among options"):

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from helpers.rollout_fakes import records
+from helpers.rollout_fakes import records, save_records
 from mme_vla.cli.results import main
 from mme_vla.errors import UserError
 from mme_vla.evaluation.results.curves import stress_curves, stress_figures
-from mme_vla.evaluation.store import RecordLog
 
 
 def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
@@ -28,9 +27,7 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
 
 def test_the_command_saves_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, made in (("a", records("test", [1, 0])), ("b", records("stress:count=3", [0, 0]))):
-        with RecordLog(tmp_path / name / "episodes.jsonl") as log:
-            for record in made:
-                log.append(record)
+        save_records(tmp_path / name, made)
     page = tmp_path / "page.html"
     main([str(tmp_path), "--stress", "--html", str(page), "--title", "a < b"])
     assert "Success over the dials" in capsys.readouterr().out

@@ -1,9 +1,11 @@
 """Commands of the library in fresh processes, as a shell starts them."""
 
 import os
+import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,3 +37,18 @@ def run(
 ) -> "subprocess.CompletedProcess[str]":
     """Run a command to its end."""
     return finish(start(*words, cwd=cwd, env=env), timeout)
+
+
+@contextmanager
+def serving(*words: str, cwd: Path = REPOSITORY, env: Mapping[str, str] | None = None) -> Iterator[int]:
+    """The port of a server that runs in a process of its own until the block ends."""
+    with start(*words, "port=0", cwd=cwd, env=env) as server:
+        try:
+            lines = ""
+            while not (ready := re.search(r"ready at \S*127\.0\.0\.1:(\d+)", lines)):
+                line = server.stderr.readline()
+                assert line, lines
+                lines += line
+            yield int(ready[1])
+        finally:
+            server.kill()

@@ -5,17 +5,21 @@ Run as a script it is an evaluation to be killed: `python rollout_stand_ins.py <
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from helpers.scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout import evaluation
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
 from mme_vla.evaluation.rollout.evaluation import Evaluation, evaluate
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import RECORDS, RecordLog
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import SMALL_VISION, small_policy
 
@@ -38,6 +42,12 @@ class InlineEnvs:
         self._running: dict[int, tuple[Job, ChunkEnv]] = {}
         self.made: dict[Job, ScriptedEnv] = {}
 
+    def __enter__(self) -> "InlineEnvs":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """No process to end."""
+
     @property
     def busy(self) -> bool:
         return bool(self._replies)
@@ -55,6 +65,15 @@ class InlineEnvs:
     def recv(self, timeout: float | None = None) -> list[Reply]:
         replies, self._replies = self._replies, []
         return replies
+
+
+def use_inline_envs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `evaluate` step its environments in this process."""
+
+    def inline(jobs: Any, workers: int, factory: Any, options: dict[str, Any], timeout: Any) -> InlineEnvs:
+        return InlineEnvs(workers, **options)
+
+    monkeypatch.setattr(evaluation, "VecEnv", inline)
 
 
 def roll(
@@ -75,9 +94,16 @@ def roll(
 def run_evaluation(
     policy: MMEPolicy, folder: Path, base: Any = make_slow_env, jobs: Sequence[Job] = JOBS, **settings: Any
 ) -> Evaluation:
-    """These episodes in two worker processes."""
+    """These episodes in two worker processes, or in this one after `use_inline_envs`."""
     options = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
     return evaluate(policy, jobs, folder, FACTS, options, base=base, show_progress=False)
+
+
+def save_records(path: Path, records: Iterable[EpisodeRecord]) -> None:
+    """Append to a file of records; of a folder, to `episodes.jsonl`."""
+    with RecordLog(path if path.suffix else path / RECORDS) as log:
+        for record in records:
+            log.append(record)
 
 
 def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:

@@ -14,7 +14,7 @@ from mme_vla.weights import load_weights
 
 TOLERANCE = 1e-4  # ten steps with the sum of two products in place of the product of a sum
 FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
-VARIANTS = ["pi05", "framesamp_context", "tokendrop_modul", "framesamp_expert"]
+VARIANTS = ["pi05", "tokendrop_modul", "framesamp_expert"]
 
 
 def learning(policy: MMEPolicy) -> set[str]:

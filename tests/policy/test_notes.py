@@ -20,7 +20,6 @@ COLUMN = "simple_subgoal"
 def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
     monkeypatch.syspath_prepend(EXAMPLE)
     policy = build_policy("scratchpad", config_dir=EXAMPLE / "configs", backbone="tiny")
-    assert isinstance(policy, MMEPolicy)
     policy.require_processor().stats = unit_stats()
     open_gates(policy)
     return policy

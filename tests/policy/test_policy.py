@@ -5,16 +5,20 @@ import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
+from mme_vla.testing.small import SMALL_VISION, random_batch, random_history, small_policy
 from mme_vla.utils import SUMS
 
 TOLERANCE = 2e-5
 FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
 """8×8 tokens a view; nothing here depends on their number."""
 MEMORY = {"budget": 128}
+NEURAL = [
+    "framesamp_context", "tokendrop_modul", "framesamp_expert", "rmt_context", "ttt_modul", "ttt_expert",
+]  # fmt: skip
+"""Every memory, and every integration with a memory that selects tokens and with a recurrent one."""
 
 
-@pytest.fixture(params=MODELS)
+@pytest.fixture(params=["pi05", *NEURAL])
 def policy(request):
     memory = {} if request.param == "pi05" else {"memory": MEMORY}
     return small_policy(request.param, backbone=FEW_TOKENS, **memory)
@@ -188,7 +192,7 @@ def test_prompt_sees_memory_only_if_requested(integration):
         assert unmoved is not sees
 
 
-@pytest.mark.parametrize("budget", [64, 512, 2048])
+@pytest.mark.parametrize("budget", [64, 2048])
 @pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt"])
 def test_budget_is_a_number_in_the_config(memory, budget):
     policy = small_policy(f"{memory}_context", backbone=FEW_TOKENS, memory={"budget": budget})
@@ -233,18 +237,14 @@ def test_checkpoint_round_trip_keeps_every_number(policy, tmp_path):
     assert torch.equal(velocity(policy, batch), velocity(loaded, batch))
 
 
-def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
+def test_foreign_checkpoints_are_refused(tmp_path):
     policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
     with pytest.raises(UserError, match=r"config\.json"):
         MMEPolicy.from_pretrained(tmp_path / "nowhere")
-    policy.save_pretrained(tmp_path / "damaged")
-    weights = tmp_path / "damaged" / "model.safetensors"
-    weights.write_bytes(weights.read_bytes()[:1000])
-    with pytest.raises(UserError, match="damaged"):
-        MMEPolicy.from_pretrained(tmp_path / "damaged")
+    policy.save_pretrained(tmp_path / "first")
     other = small_policy("tokendrop_expert", backbone=FEW_TOKENS)
     other.save_pretrained(tmp_path / "other")
-    (tmp_path / "other" / "config.json").write_text((tmp_path / "damaged" / "config.json").read_text())
+    (tmp_path / "other" / "config.json").write_text((tmp_path / "first" / "config.json").read_text())
     (tmp_path / "other" / SUMS).unlink()
     with pytest.raises(UserError, match=r"(?s)missing.*unexpected"):
         MMEPolicy.from_pretrained(tmp_path / "other")

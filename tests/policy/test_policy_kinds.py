@@ -12,10 +12,6 @@ from mme_vla.training.runs import _completed, differing_keys
 from mme_vla.training.settings import TrainSettings
 
 
-def settings(**values: Any) -> TrainSettings:
-    return TrainSettings(**{"steps": 100, "batch_size": 1, "lr": 1.0, "warmup": 10, **values})
-
-
 @register("policy", "quiet")
 class QuietPolicy(MMEPolicy):
     """A kind of policy of one's own."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from helpers import REPOSITORY
 from helpers.probe_fakes import SIDE, MadeUpSource
-from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
+from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll, use_inline_envs
 from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import verify
@@ -233,7 +233,8 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(tmp_path: Path, mo
 
 
 @pytest.mark.slow
-def test_a_card_runs_every_arm_and_resumes(tmp_path: Path) -> None:
+def test_a_card_runs_every_arm_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    use_inline_envs(monkeypatch)
     policy, donors = reader(CONTENT), recordings()
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     settings = RolloutSettings(max_steps=16, flow_steps=2, workers=1, max_batch=1)

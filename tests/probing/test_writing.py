@@ -129,20 +129,8 @@ def test_the_score_separates_evidence_from_chance_on_every_task(task: str) -> No
 def test_the_command_writes_scores_and_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
     output = tmp_path / "writing.json"
-    main(
-        [
-            "writing",
-            "--memories",
-            "anchors",
-            "oracle",
-            "--tasks",
-            "VideoUnmask",
-            "--episodes",
-            "1",
-            "--output",
-            str(output),
-        ]
-    )
+    words = "writing --memories anchors oracle --set memory.spacing=15 --tasks VideoUnmask --episodes 1 --output"
+    main([*words.split(), str(output)])
     rows = json.loads(output.read_text())
     assert rows["oracle"]["mean"]["score"] == 1 and rows["anchors"]["mean"]["recall"] == 1, (
         "the cubes lie open at frame 0"

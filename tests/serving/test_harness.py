@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers import commands
-
 vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness")
 from vla_eval.api import serve_background  # noqa: E402
 from vla_eval.benchmarks.base import StepBenchmark, StepResult  # noqa: E402
@@ -161,13 +159,6 @@ def test_it_asks_for_what_the_policy_reads() -> None:
 def test_a_robot_that_moves_by_waypoints_is_refused() -> None:
     with pytest.raises(UserError, match="its action space is 'waypoint'"):
         MMEVLAModelServer(small_policy("pi05", embodiment="robomme_waypoint"))
-
-
-@pytest.mark.slow
-def test_the_command_shows_the_harnesss_words() -> None:
-    done = commands.run("mme_vla", "harness", "--help")
-    assert done.returncode == 0, done.stderr
-    assert "--args.checkpoint" in done.stdout and "--args.flow_steps" in done.stdout
 
 
 @pytest.mark.parametrize(

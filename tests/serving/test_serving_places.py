@@ -95,7 +95,7 @@ def resident_mib() -> float:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads memory from /proc")
-@pytest.mark.parametrize("path", ["/healthz", "/metadata", "/infer"])
+@pytest.mark.parametrize("path", ["/healthz", "/infer"])
 def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
     monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.5)
     piece = bytes(2**20)

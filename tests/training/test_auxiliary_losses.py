@@ -32,7 +32,6 @@ TABLE = "data/chunk-000/file-000.parquet"
 def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
     monkeypatch.syspath_prepend(EXAMPLE)
     policy = build_policy("write_head_modul", config_dir=EXAMPLE / "configs", memory={"budget": 64})
-    assert isinstance(policy, MMEPolicy)
     policy.require_processor().stats = unit_stats()
     open_gates(policy)
     return policy.train()
@@ -40,7 +39,6 @@ def policy(monkeypatch: pytest.MonkeyPatch) -> MMEPolicy:
 
 def labelled(policy: MMEPolicy) -> Batch:
     batch = random_batch(policy, batch=2, valid=32)
-    assert batch.history is not None
     labels = Labels({BOUNDARY: (batch.history.positions[..., 0] % 2).float() * batch.history.mask})
     return replace(batch, history=replace(batch.history, labels=labels))
 
@@ -147,7 +145,6 @@ def test_joined_memories_read_labels_and_return_losses(policy: MMEPolicy) -> Non
         "pi05", memory=[{"name": "write_head", "budget": 32}, {"name": "framesamp", "budget": 32}],
         integration="modulator", config_dir=EXAMPLE / "configs",
     )  # fmt: skip
-    assert isinstance(joined, MMEPolicy)
     joined.require_processor().stats = unit_stats()
     assert joined.memory.reads_labels == (BOUNDARY,)
     assert "losses/write_head/write" in loss_of(joined.train(), labelled(joined))[1]

@@ -13,8 +13,9 @@ from mme_vla.config.composition import compose
 from mme_vla.policy.tensor_files import assign_tensors, load_tensors, take_memory
 
 WORDS = [
-    "model=tokendrop_expert", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
-    "backbone.vision.patch_size=2", "memory.budget=64", "train.steps=3", "train.save_every=1", "train.val_every=2",
+    "model=ttt_modul", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
+    "backbone.vision.patch_size=2", "memory.budget=64", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2",
+    "train.steps=3", "train.save_every=1", "train.val_every=2",
     "train.val_samples=1", "train.batch_size=1", "train.open_loop_chunks=0", "train.device=cpu", "train.workers=0",
     "train.keep.last=3", "logger=none", "resume=auto",
 ]  # fmt: skip
