@@ -15,7 +15,7 @@ from mme_vla.training.logging import read_metrics
 
 pytestmark = pytest.mark.slow
 
-STEPS, WINDOW = 24, 6
+STEPS, WINDOW = 30, 6
 SMALL = [
     "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2",
     "backbone.vision.width=16", "backbone.vision.mlp_dim=16", "policy.augment=false", "logger=none",
