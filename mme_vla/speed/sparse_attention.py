@@ -88,8 +88,8 @@ class PackedMask(NamedTuple):
         outputs = []
         for part, run in zip(q.split([run.queries for run in self.runs], 1), self.runs, strict=True):
             # The kernel leaves whatever memory held as the gradient of keys that no sample has, past the last start.
-            unseen = (torch.arange(len(run.order), device=k.device) >= run.starts[-1])[:, None, None]
-            keys, values = (x.flatten(0, 1)[run.order].masked_fill(unseen, 0) for x in (k, v))
+            is_invalid = (torch.arange(len(run.order), device=k.device) >= run.starts[-1])[:, None, None]
+            keys, values = (x.flatten(0, 1)[run.order].masked_fill(is_invalid, 0) for x in (k, v))
             queries = part.flatten(0, 1)
             of_sample = torch.arange(batch + 1, device=q.device, dtype=torch.int32) * run.queries
             attend = varlen_attn if q.is_cuda else _one_by_one
