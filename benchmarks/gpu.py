@@ -206,7 +206,9 @@ def alone(
             gc.collect()
             show_model(model, {part: rows[model][part]})
             yield
-    if "lerobot" in parts and find_spec("lerobot") and find_spec("transformers"):
+    if "lerobot" in parts and not find_spec("transformers"):
+        print("LeRobot's PI05: not measured, since transformers is not installed (the extra `vlm` has it)")
+    elif "lerobot" in parts:
         from gpu_lerobot import lerobot_row
 
         result["lerobot"] = lerobot_row(setup)
