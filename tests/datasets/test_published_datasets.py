@@ -70,9 +70,9 @@ def tables(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ours(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def converted(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recordings as this library converts them."""
-    folder = tmp_path_factory.mktemp("converted") / "ours"
+    folder = tmp_path_factory.mktemp("converted") / "dataset"
     convert(list_episodes(find_files([recordings])), folder, ConvertOptions(images="png"))
     return folder
 
@@ -112,18 +112,18 @@ def test_a_memory_that_scores_patches_is_warned_of_lossy_videos(
         assert ("passes for motion" in caplog.text) == warned
 
 
-def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, tables: Path, ours: Path) -> None:
+def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, tables: Path, converted: Path) -> None:
     (tmp_path / "starts.json").write_text('{"0": 0, "1": 2, "2": 4}')
     source = EpisodeSource(tables, exec_starts=tmp_path / "starts.json")
     assert source.video_cameras == () and source.lossy == {}
-    converted = EpisodeSource(ours)
-    np.testing.assert_array_equal(source.frames(1, range(9), "wrist"), converted.frames(2, range(9), "wrist"))
+    expected = EpisodeSource(converted)
+    np.testing.assert_array_equal(source.frames(1, range(9), "wrist"), expected.frames(2, range(9), "wrist"))
 
 
 def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_named(
-    tmp_path: Path, tables: Path, ours: Path
+    tmp_path: Path, tables: Path, converted: Path
 ) -> None:
-    assert first_frames(tables, annotated_episodes([ours])) == [0, 2, 4]
+    assert first_frames(tables, annotated_episodes([converted])) == [0, 2, 4]
     write_file(tmp_path / "record_dataset_AnotherSeed.h5", LENGTHS, videos=VIDEOS, size=16)
     with pytest.raises(UserError, match=r"episode 0 .*is not among the 3 episodes given: the nearest is .* rad"):
         first_frames(tables, annotated_episodes([tmp_path]))

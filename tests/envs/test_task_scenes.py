@@ -20,7 +20,7 @@ SCENES = json.loads((REPOSITORY / "tests" / "data" / "task_scenes.json").read_te
 def describe(task: str, **scene: Any) -> dict[str, Any]:
     env = make_task(task, render=False, **scene)
     env.reset()
-    found = {
+    description = {
         "goals": env.goals(),
         "subtasks": [
             [step.text, step.grounded_text, step.choice, step.video, [thing.name for thing in step.targets]]
@@ -31,18 +31,18 @@ def describe(task: str, **scene: Any) -> dict[str, Any]:
         "places": {thing.name: [*thing.pose.p.tolist(), *thing.pose.q.tolist()] for thing in env.things},
     }
     env.close()
-    return found
+    return description
 
 
 def leaves(value: Any, path: str = "") -> dict[str, Any]:
     """What is in nested dicts and lists, by its path; an empty one is there itself."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    found = {name: leaf for key, item in items for name, leaf in leaves(item, f"{path}.{key}").items()}
-    return found or {path: value}
+    flat = {name: leaf for key, item in items for name, leaf in leaves(item, f"{path}.{key}").items()}
+    return flat or {path: value}
 
 
-def same(found: Any, recorded: Any) -> bool:
-    return abs(found - recorded) <= 1e-5 if isinstance(recorded, int | float) else found == recorded
+def is_close(actual: Any, recorded: Any) -> bool:
+    return abs(actual - recorded) <= 1e-5 if isinstance(recorded, int | float) else actual == recorded
 
 
 def test_every_task_is_in_the_file() -> None:
@@ -54,6 +54,6 @@ def test_a_scene_has_its_words_values_and_places(recorded: dict[str, Any]) -> No
     recorded = dict(recorded)
     scene = {key: recorded.pop(key) for key in ("task", "seed", "difficulty", "recovery") if key in recorded}
     described = describe(**scene)
-    found, expected = leaves({key: described[key] for key in recorded}), leaves(recorded)
-    assert found.keys() == expected.keys()
-    assert {path: found[path] for path in expected if not same(found[path], expected[path])} == {}
+    actual, expected = leaves({key: described[key] for key in recorded}), leaves(recorded)
+    assert actual.keys() == expected.keys()
+    assert {path: actual[path] for path in expected if not is_close(actual[path], expected[path])} == {}

@@ -1,6 +1,6 @@
 """Rollouts of the scripted environment, in this process and in workers.
 
-Run as a script it is an evaluation to be killed: `python rollout_stand_ins.py <folder> <checkpoint> <seconds a step>`.
+Run as a script it is an evaluation to be killed: `python rollout_fakes.py <folder> <checkpoint> <seconds a step>`.
 """
 
 import os
