@@ -49,8 +49,8 @@ def test_keys_of_no_sample_get_no_gradient_whatever_the_kernel_leaves_there(monk
     def kernel(*arguments: Any) -> Tensor:
         """Flash attention writes no gradient for rows past the last start: NaN here, any number on a GPU."""
         for x in arguments[1:3]:
-            is_invalid = torch.arange(len(x)) >= arguments[4][-1]
-            x.register_hook(lambda gradient, is_invalid=is_invalid: gradient.masked_fill(is_invalid[:, None, None], torch.nan))
+            is_invalid = (torch.arange(len(x)) >= arguments[4][-1])[:, None, None]
+            x.register_hook(lambda gradient, mask=is_invalid: gradient.masked_fill(mask, torch.nan))
         return one_by_one(*arguments)
 
     one_by_one = sparse_attention._one_by_one
