@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
+from mme_vla.envs.scene.arithmetic import norm
 from mme_vla.envs.scene.objects import BELOW_TABLE, COLOURS, RGB, WHITE, Disc, build_highlight, build_sphere
 from mme_vla.envs.scene.things import AWAY, Thing, distance_xy
 
@@ -138,7 +139,7 @@ def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start:
 def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
     """Linear mixture of two quaternions, normalised."""
     mixed = (1 - alpha) * np.asarray(a) + alpha * np.asarray(b)
-    return mixed / np.linalg.norm(mixed)
+    return mixed / norm(mixed)
 
 
 def planned_swaps(

@@ -11,9 +11,9 @@ import numpy as np
 import sapien
 import sapien.render
 import torch
-from mani_skill.utils.geometry.rotation_conversions import euler_angles_to_matrix, matrix_to_quaternion
 from transforms3d.euler import euler2quat
 
+from mme_vla.envs.scene.arithmetic import square_root
 from mme_vla.envs.scene.things import Thing
 
 if TYPE_CHECKING:
@@ -171,13 +171,31 @@ class Board(Thing):
 
 
 def cube_pose(xy: XY, yaw: float, half_size: float = H) -> sapien.Pose:
-    """Pose of a cube on the table, turned by tensors in single precision, as in the benchmark.
+    """Pose of a cube on the table, turned in single precision, as in the benchmark.
 
     The last bit of its quaternion decides the order of the axes of its bounding box, and so where the next object is
     placed.
     """
-    q = matrix_to_quaternion(euler_angles_to_matrix(torch.tensor([0.0, 0.0, yaw]), "XYZ"))
-    return sapien.Pose([float(xy[0]), float(xy[1]), half_size], q.numpy())
+    return sapien.Pose([float(xy[0]), float(xy[1]), half_size], quaternion_about_z(yaw))
+
+
+def quaternion_about_z(yaw: float) -> np.ndarray:
+    """Quaternion wxyz of a turn about the vertical, float32 [4], w not negative.
+
+    It is taken from the entries of the rotation matrix, in the order of operations in which ManiSkill takes it from a
+    matrix of tensors: the larger of w and z by its square, the other one by the off-diagonal entries.
+    """
+    angle = torch.tensor(yaw)
+    cos, sin = np.float32(angle.cos().item()), np.float32(angle.sin().item())
+    one, two, zero = np.float32(1), np.float32(2), np.float32(0)
+    w_squared, z_squared = one + cos + cos + one, one - cos - cos + one  # four times the squares
+    w = square_root(w_squared) if w_squared > 0 else zero
+    z = square_root(z_squared) if z_squared > 0 else zero
+    if w >= z:
+        quaternion = np.array([w * w, zero, zero, sin + sin]) / (two * w)
+    else:
+        quaternion = np.array([sin + sin, zero, zero, z * z]) / (two * z)
+    return -quaternion if quaternion[0] < 0 else quaternion
 
 
 def build_cube(env: "Stage", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:

@@ -6,18 +6,19 @@ free place: an obstacle is the shadow of the first two axes of its bounding box,
 the gap depends on what is placed.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
-from mani_skill.utils.geometry.trimesh_utils import get_component_mesh
+from mani_skill.utils.geometry.trimesh_utils import get_component_meshes, merge_meshes
 from sapien import physx
 from torch import Tensor
-from trimesh import Trimesh
 
+from mme_vla.envs.scene.arithmetic import matrix_product
 from mme_vla.envs.scene.articulated import BUTTON_BASE, Button
+from mme_vla.envs.scene.bounding_box import shadow_of_smallest_box
 from mme_vla.envs.scene.objects import Board, Disc, H
 from mme_vla.envs.scene.things import Thing
 
@@ -37,8 +38,11 @@ class Draws:
         return torch.rand(n, generator=self._generator)
 
     def between(self, low: float, high: float) -> float:
-        """One number in [low, high), as torch's in-place `uniform_` gives it."""
-        return torch.empty(1).uniform_(low, high, generator=self._generator).item()
+        """One number in [low, high), as torch's `uniform_` gives it where multiplying and adding are one instruction."""
+        low_bound, high_bound = np.float32(low), np.float32(high)
+        # Exact in double precision but for the last addition, so that the float32 is rounded once on every CPU.
+        width = np.float64(high_bound - low_bound)
+        return float(np.float32(np.float64(self.uniform()) * width + np.float64(low_bound)))
 
     def integer(self, low: int, high: int) -> int:
         """One integer in low … high - 1."""
@@ -65,8 +69,6 @@ TRIALS = 256
 CONTAINER_HALF = 0.0275
 """Half the width of a container as the placement counts it, metres."""
 BUTTON_CLEARANCE = 1.5 * BUTTON_BASE[0]
-VERTICAL = 1e-6
-"""An axis whose part on the table is shorter than this stands upright."""
 
 
 class SceneError(RuntimeError):
@@ -107,7 +109,7 @@ class Box2D:
     @classmethod
     def square(cls, centre: np.ndarray, half: float, yaw: float) -> "Box2D":
         """A square turned by `yaw` radians."""
-        cos, sin = np.cos(yaw), np.sin(yaw)
+        cos, sin = math.cos(yaw), math.sin(yaw)
         return cls(centre, np.array([[cos, sin], [-sin, cos]]), np.array([half, half]))
 
     def grown(self, gap: float) -> "Box2D":
@@ -117,17 +119,31 @@ class Box2D:
     def distance(self, point: np.ndarray) -> float:
         """From a point to the nearest point of the rectangle, metres."""
         offset = point - self.centre
-        nearest = np.clip(self.axes @ offset, -self.half, self.half) @ self.axes
-        return float(np.linalg.norm(offset - nearest))
+        nearest = np.zeros(2)
+        for axis, half in zip(self.axes, self.half, strict=True):
+            nearest = nearest + np.clip(_dot(axis, offset), -half, half) * axis
+        return _length(offset - nearest)
 
     def intersects(self, other: "Box2D") -> bool:
         """Whether the two overlap or touch: no side of either separates them."""
         offset = other.centre - self.centre
         for axis in (*self.axes, *other.axes):
-            reach = self.half @ np.abs(self.axes @ axis) + other.half @ np.abs(other.axes @ axis)
-            if abs(float(offset @ axis)) > reach:
+            if abs(_dot(offset, axis)) > self._reach(axis) + other._reach(axis):
                 return False
         return True
+
+    def _reach(self, direction: np.ndarray) -> float:
+        """How far the rectangle extends from its centre along a direction, metres."""
+        return self.half[0] * abs(_dot(self.axes[0], direction)) + self.half[1] * abs(_dot(self.axes[1], direction))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Inner product of two vectors [2]; that of BLAS is rounded otherwise on some CPUs."""
+    return a[0] * b[0] + a[1] * b[1]
+
+
+def _length(a: np.ndarray) -> float:
+    return math.sqrt(_dot(a, a))
 
 
 type Avoid = Thing | Box2D
@@ -150,22 +166,12 @@ def obstacle_box(thing: Thing) -> Box2D:
 
 def _bounds(thing: Thing) -> Box2D | None:
     body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
-    mesh = get_component_mesh(body)
+    mesh = merge_meshes(get_component_meshes(body))
     if mesh is None:
         return None
-    transform, extents = _smallest_box(mesh.vertices.tobytes(), mesh.faces.tobytes())
-    centre, axes = transform[:2, 3], transform[:2, :2].T
-    length = np.linalg.norm(axes, axis=1, keepdims=True)
-    axes = np.where(length > VERTICAL, axes / np.maximum(length, VERTICAL), 0.0)
-    return Box2D(np.array(centre), axes, extents[:2] / 2)
-
-
-@lru_cache(maxsize=256)
-def _smallest_box(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Pose [4, 4] and widths [3]; cached, since an object is an obstacle for all that are placed after it."""
-    mesh = Trimesh(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3), process=False)
-    box = mesh.bounding_box_oriented.primitive
-    return np.array(box.transform), np.array(box.extents)
+    pose = body.pose.to_transformation_matrix().astype(np.float64)
+    vertices = matrix_product(pose[:3, :3], np.asarray(mesh.vertices).T).T + pose[:3, 3]
+    return Box2D(*shadow_of_smallest_box(vertices.tobytes(), mesh.faces.tobytes()))
 
 
 def button_box(button: Button) -> Box2D:
@@ -221,7 +227,7 @@ def draw_disc(
     for _ in range(TRIALS):
         xy = region.place(draws, radius)
         clear = all(obstacle.distance(xy) >= radius + gap for obstacle in obstacles)
-        if clear and all(np.linalg.norm(xy - centre) >= radius + gap + other for centre, other in circles):
+        if clear and all(_length(xy - centre) >= radius + gap + other for centre, other in circles):
             return xy
     return None
 

@@ -44,8 +44,9 @@ class RouteStick(Task):
 
     def build(self, draws: Draws) -> None:
         angle = math.radians(self.values.number("layout.rotation_deg", lambda: -30 + 60 * draws.uniform()))
-        rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        places = [rotation @ (CENTRE_X, (i - PLACES // 2) * SPACING) for i in range(PLACES)]
+        cos, sin = math.cos(angle), math.sin(angle)
+        row = [(i - PLACES // 2) * SPACING for i in range(PLACES)]
+        places = [np.array([cos * CENTRE_X - sin * y, sin * CENTRE_X + cos * y]) for y in row]
         self.all_discs = [
             self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01))
             for i, xy in enumerate(places)
