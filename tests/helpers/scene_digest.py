@@ -1,4 +1,7 @@
-"""One digest of the scenes of `tests/data/task_scenes.json`, to the bit: `python -m helpers.scene_digest [EVERY]` prints it."""
+"""One digest of the scenes of `tests/data/task_scenes.json`, to the bit.
+
+`python -m helpers.scene_digest [EVERY]` prints it.
+"""
 
 import hashlib
 import json

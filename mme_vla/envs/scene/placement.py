@@ -38,7 +38,7 @@ class Draws:
         return torch.rand(n, generator=self._generator)
 
     def between(self, low: float, high: float) -> float:
-        """One number in [low, high), as torch's `uniform_` gives it where multiplying and adding are one instruction."""
+        """One number in [low, high), as torch's `uniform_` gives it where it multiplies and adds at once."""
         low_bound, high_bound = np.float32(low), np.float32(high)
         # Exact in double precision but for the last addition, so that the float32 is rounded once on every CPU.
         width = np.float64(high_bound - low_bound)
