@@ -191,10 +191,13 @@ class RoboMMEEnv(gymnasium.Env):
         run = self._run = _Run(control, task.progress.displayed, task.reset_action, options=options)
         self._grounding.clear()
         self._observer.start()
-        for subtask in task.progress.subtasks:
-            if subtask.video and options["video"]:
-                self._demonstrate(subtask)
+        # The video is the recorded one, whose texts change when its drops were noticed.
+        with task.as_recorded():
+            for subtask in task.progress.subtasks:
+                if subtask.video and options["video"]:
+                    self._demonstrate(subtask)
         run.in_video = False
+        task.unrecorded_steps = 1
         self._step_control(task.start_action)
         return as_lists(run.frames, self._keys), dict(run.info)
 

@@ -33,7 +33,9 @@ def test_the_video_ends_with_the_swaps_one_after_another(build_task):
     assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]
     assert env.goals() == [
         "watch the video carefully, then pick up the same block that was previously picked up again, "
-        "finally put it down and press the button to stop"
+        "finally put it down and press the button to stop",
+        "watch the video carefully, then pick up the same cube that was previously picked up again, "
+        "finally press the button to stop",
     ]
     env.progress.index = 3
     wait(env)  # the swaps begin in the step after the one in which the stage was seen

@@ -43,6 +43,17 @@ def wait(env: Task, steps: int = 1) -> Flags:
     return bool(info["success"]), bool(info["fail"])
 
 
+def touches(env: Task) -> bool:
+    """Whether anything pressed on the robot in the last physics step."""
+    robot = {link._objs[0] for link in env.agent.robot.links}
+    for contact in env.scene.px.get_contacts():
+        one, other = (body in robot for body in contact.bodies)
+        pressed = any(np.any(point.impulse) for point in contact.points)
+        if one != other and pressed:
+            return True
+    return False
+
+
 def go_to(env: Task, text: str) -> None:
     """Go to the first sub-task of the execution that has this text."""
     env.progress.index = next(i for i, s in enumerate(env.progress.subtasks) if s.text == text and not s.video)

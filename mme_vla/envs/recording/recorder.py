@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
-    """Perform the sub-tasks of a task that has just been reset, with `env.recording` set; whether it succeeded.
+    """Perform the sub-tasks of a task that has just been reset, evaluated `as_recorded`; whether it succeeded.
 
     The task is evaluated before and after each sub-task; `env.progress.planned` moves at these evaluations only. In a
     recovery demonstration the sampled pick of the execution fails once first.
@@ -36,8 +36,7 @@ def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["Sub
     """
     subtasks = env.progress.subtasks if subtasks is None else subtasks
     picks = [subtask for subtask in subtasks if subtask.pick and not subtask.video]
-    recording, env.recording = env.recording, True
-    try:
+    with env.as_recorded():
         ended = _ended(env)
         for subtask in subtasks:
             if ended or _ended(env):
@@ -47,8 +46,6 @@ def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["Sub
                 demonstrator.fail_next_pick = env.recovery if failing else None
             subtask.run(demonstrator)
             ended = _ended(env)
-    finally:
-        env.recording = recording
     return env.success() and not env.progress.failed
 
 
@@ -129,7 +126,6 @@ class Recorder:
         self._waypoint: np.ndarray | None = None
         self._in_video: bool | None = None
         self._last_stored: str | int | None = None
-        self._displayed = task.progress.displayed
         self._result = Recording(success=False, steps=0)
         self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
         task.on_frame = self._on_frame
@@ -146,6 +142,7 @@ class Recorder:
         if self._result.steps >= limit:
             raise TooLongError(f"not done after {limit} control steps")
         self._action = np.asarray(action, np.float64)
+        self._displayed = self._task.progress.displayed  # the text is set before the evaluation moves the pointer
         self._task.step(np.asarray(action, np.float32))
         self._result.steps += 1
 
@@ -162,13 +159,11 @@ class Recorder:
     def _on_frame(self, evaluated: dict[str, Any]) -> None:
         self._observer.follow()
         progress = self._task.progress
-        # The text was set before the evaluation moved the pointer: it follows one step later.
-        displayed, self._displayed = self._displayed, progress.displayed
         planned = progress.demonstrated
         self._enter_phase()
         if planned.text == NO_RECORD:
             return
-        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, displayed))
+        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned))
         self._result.stored += 1
         self._result.video += planned.video
         if self._on_step is None:
@@ -207,8 +202,8 @@ class Recorder:
             "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in pixel]}),
         }
 
-    def _texts(self, planned: "SubTask", displayed: "SubTask") -> dict[str, Any]:
-        progress = self._task.progress
+    def _texts(self, planned: "SubTask") -> dict[str, Any]:
+        progress, displayed = self._task.progress, self._displayed
         completed = progress.succeeded
         segmentation = self._observer.segmentation if self._render else None
         now = "completed" if completed else progress.planned

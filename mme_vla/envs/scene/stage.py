@@ -1,7 +1,7 @@
 """The stage of a task: robot, table, cameras and the step counter."""
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, ClassVar
 
 import numpy as np
@@ -49,13 +49,15 @@ class Stage(BaseEnv):
         self.seed = seed
         self.second_tries = second_tries
         self.recording = False
-        """A demonstrator is recording: `dropped` is evaluated as it was when the official data were recorded."""
+        """`dropped` is evaluated as it was when the official data were recorded; see `as_recorded`."""
         self.reset_in_progress = False
         """The arm is being driven back between the conditioning video and the execution."""
         self.after_video = False
         """The arm has begun to be driven back after the conditioning video."""
         self.stored_qpos: np.ndarray | None = None
         """Joint angles [7] at the end of the stick's first approach, where its execution begins."""
+        self.unrecorded_steps = 0
+        """Steps of this episode that a recording of it does not have."""
         super().__init__(
             *args, robot_uids=robot_uids or (STICK if self.stick else WRISTCAM), control_mode=control_mode, **kwargs
         )
@@ -117,13 +119,28 @@ class Stage(BaseEnv):
         self.agent.robot.set_pose(sapien.Pose(ROBOT_BASE))
         self.reset_in_progress = self.after_video = False
         self.stored_qpos = None
+        self.unrecorded_steps = 0
 
     # Steps --------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def as_recorded(self) -> Iterator[None]:
+        """Evaluate as when the official data were recorded, while a demonstrator acts; afterwards as before."""
+        before, self.recording = self.recording, True
+        try:
+            yield
+        finally:
+            self.recording = before
 
     @property
     def steps_done(self) -> int:
         """Control steps since the reset."""
         return int(self._elapsed_steps[0])
+
+    @property
+    def steps_waited(self) -> int:
+        """Likewise, as a wait counts them: evaluated `as_recorded`, without those that a recording does not have."""
+        return self.steps_done - self.unrecorded_steps if self.recording else self.steps_done
 
     @property
     def reset_action(self) -> np.ndarray:

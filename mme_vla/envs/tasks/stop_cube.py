@@ -145,7 +145,7 @@ class StopCube(Task):
     def _wait(self, until: int) -> SubTask:
         return SubTask(
             "remain static",
-            done=lambda: self.steps_done >= until,
+            done=lambda: self.steps_waited >= until,
             run=lambda demo: demo.hold_until(until),
             choice="b",
             operation=self._mistaken,

@@ -167,8 +167,17 @@ class SwingXtimes(Task):
         ]
 
     def goals(self) -> list[str]:
-        pick = f"pick up the {self.cube.colour} cube, move it to the top of the right-side target, then"
+        pick = f"pick up the {self.cube.colour} cube, move it to the"
+        first, second = f"{pick} top of the right-side target, then", f"{pick} right-side target and then"
         if self.repetitions == 1:
-            return [f"{pick} put it down on the left-side target, finally press the button to stop"]
-        times = f"repeating this back-and-forth motion {number(self.repetitions)} times"
-        return [f"{pick} move it to the top of the left-side target, {times}, finally press the button to stop"]
+            return [
+                f"{first} put it down on the left-side target, finally press the button to stop",
+                f"{second} put it down on the left-side target, then press the button to stop",
+            ]
+        times = f"{number(self.repetitions)} times"
+        return [
+            f"{first} move it to the top of the left-side target, repeating this back-and-forth motion {times}, "
+            "finally press the button to stop",
+            f"{second} to the left-side target, repeating this right-to-left swing motion {times}, then put down the "
+            "cube and press the button to stop",
+        ]

@@ -43,14 +43,15 @@ class VideoPlaceButton(VideoPlace):
         return [*visible[0], self.show_press(), *visible[1], *(self.put_back(self.cube) if self.tier else [])]
 
     def goals(self) -> list[str]:
-        start = f"watch the video carefully, then place the {self.cube.colour} cube on the target"
+        place = f"place the {self.cube.colour} cube on the target"
+        start = f"watch the video carefully, then {place}"
         when = "before" if self.before else "after"
         order = "last placed before" if self.before else "first placed after"
         if self.tier:
             return [f"{start} where it was {order} the button was pressed"]
         return [
             f"{start} right {when} the button was pressed",
-            f"{start} immediately {when} the button was pressed",
+            f"watch the video carefully, and {place} where it was placed immediately {when} the button was pressed",
             f"{start} where it was previously placed {when} the button was pressed",
             f"{start} where it was {order} the button was pressed",
         ]

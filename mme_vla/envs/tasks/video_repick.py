@@ -223,13 +223,19 @@ class VideoRepick(Task):
         ]
 
     def goals(self) -> list[str]:
-        start = "watch the video carefully, then"
+        watch, same_cube = "watch the video carefully", "pick up the same cube that was previously picked up"
+        same_block = "the same block that was previously picked up"
         if self.repetitions == 1:
-            again = "pick up the same block that was previously picked up again"
-            return [f"{start} {again}, finally put it down and press the button to stop"]
-        times = f"for {number(self.repetitions)} times"
-        again = f"repeatedly pick up and put down the same block that was previously picked up {times}"
+            return [
+                f"{watch}, then pick up {same_block} again, finally put it down and press the button to stop",
+                f"{watch}, then {same_cube} again, finally press the button to stop",
+            ]
+        times = f"{number(self.repetitions)} times"
+        short = "twice" if self.repetitions == 2 else times
         return [
-            f"{start} {again}, finally put it down and press the button to stop",
-            f"{start} {again}, finally press the button to stop",
+            f"{watch}, then repeatedly pick up and put down {same_block} for {times}, finally put it down and press "
+            "the button to stop",
+            f"{watch}, then {same_cube} {short}, and finally press the button to stop",
+            f"{watch}, identify the cube that was picked up, then pick up and place down the same cube {short}, "
+            "finally press the button to stop",
         ]
