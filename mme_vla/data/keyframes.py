@@ -258,7 +258,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         number, episode, keyframes, links = self.window(index)
         frames = [link.frame for link in links]
         sample = KeyframeSample(
-            goal=self.sources[number].goal(episode),
+            goal=self.sources[number].goal(episode),  # one for the whole chain, or an error that names them
             shots=keyframes.shots(frames),
             open=keyframes.commanded_open(frames),
             places=np.array([link.place for link in links]),
