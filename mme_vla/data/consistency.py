@@ -344,11 +344,12 @@ def _check_videos(dataset: Description, column: str) -> None:
     begins = np.asarray(episodes[f"{column}/from_timestamp"])
     _check_ends(dataset, column, begins)
     places = np.stack([episodes[f"{column}/chunk_index"], episodes[f"{column}/file_index"]], axis=1)
-    groups: dict[Path, list[int]] = {}
-    for episode, (chunk, file) in enumerate(places.tolist()):
+    files, file_of_episode = np.unique(places, axis=0, return_inverse=True)
+    order = {}
+    for number, (chunk, file) in enumerate(files.tolist()):
         path = video_file(dataset.root, dataset.info.get("video_path"), column, chunk, file)
-        groups.setdefault(path, []).append(episode)
-    order = {path: np.array(inside)[np.argsort(begins[inside], kind="stable")] for path, inside in groups.items()}
+        inside = np.flatnonzero(file_of_episode.reshape(-1) == number)
+        order[path] = inside[np.argsort(begins[inside], kind="stable")]
     for path, inside in order.items():
         _check_neighbours(dataset, column, path, inside, begins[inside])
     with ThreadPoolExecutor(_AT_ONCE) as pool:
