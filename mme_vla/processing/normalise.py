@@ -207,9 +207,15 @@ class _Magnitudes:
         self._count += len(values)
 
     def quantile(self, q: float) -> float:
-        """The middle of the first bin at which the count from the lowest on reaches q of all."""
-        counts = np.concatenate([self._below[::-1], [self._at_centre], self._above])
-        place = int(np.searchsorted(counts.cumsum(), q * self._count)) - len(self._below)
+        """The quantile as numpy's, between the two values nearest to it, each the middle of its bin."""
+        below = np.concatenate([self._below[::-1], [self._at_centre], self._above]).cumsum()
+        rank = q * (self._count - 1)
+        low, high = (self._value(below, int(side)) for side in (np.floor(rank), np.ceil(rank)))
+        return low + (high - low) * (rank - np.floor(rank))
+
+    def _value(self, below: np.ndarray, rank: int) -> float:
+        """About the value of a rank from 0; below: counts of values up to each bin, from the lowest on."""
+        place = int(np.searchsorted(below, rank, side="right")) - len(self._below)
         if place == 0:
             return self._centre
         power, part = divmod(abs(place) - 1, self.PARTS)

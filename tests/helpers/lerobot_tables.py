@@ -45,8 +45,9 @@ def write_video(
     path: Path, images: Sequence[np.ndarray], rate: float = FPS, pixel_format: str = "yuv420p", coder: str = "libx264"
 ) -> None:
     """A lossless video of these images at an even rate."""
-    import av
     from fractions import Fraction
+
+    import av
 
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
