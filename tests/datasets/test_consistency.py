@@ -210,7 +210,7 @@ def test_totals_of_the_description_must_agree(tmp_path: Path, edit, words: str) 
 
 def test_the_length_of_an_episode_must_be_that_of_its_rows(tmp_path: Path) -> None:
     change(write_dataset(tmp_path), EPISODES, "length", [5, 3])
-    with pytest.raises(UserError, match="episode 1 has length 3, but .* give it 4 rows"):
+    with pytest.raises(UserError, match=r"episode 1 has length 3, but .* give it 4 rows"):
         opened(tmp_path)
 
 
@@ -231,7 +231,7 @@ def test_both_marks_of_a_conditioning_video_must_agree(tmp_path: Path) -> None:
     shutil.copytree(SAMPLE, root)
     rows = pq.ParquetFile(root / ROWS).read()["exec_start_idx"].to_pylist()
     change(root, ROWS, "exec_start_idx", pa.array([60, *rows[1:]], pa.int32()))
-    with pytest.raises(UserError, match="row 0, .* has exec_start_idx 60, but is_demo marks the first 66 frames"):
+    with pytest.raises(UserError, match=r"row 0, .* has exec_start_idx 60, but is_demo marks the first 66 frames"):
         EpisodeSource(root)
 
 
@@ -263,9 +263,7 @@ def test_episodes_that_share_pictures_are_named(tmp_path: Path) -> None:
     write_dataset(tmp_path, video=True)
     change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", [0.0, 0.0])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 0.4])
-    with pytest.raises(
-        UserError, match=r"episodes 0 and 1 overlap in the video file-000.mp4 of observation.images.top"
-    ):
+    with pytest.raises(UserError, match=r"episodes 0 and 1 overlap in the video file-000.mp4 of observation"):
         opened(tmp_path)
 
 
@@ -383,9 +381,7 @@ def test_the_same_names_in_another_order_are_refused_and_other_names_named(tmp_p
     names = ["shoulder", "elbow", "gripper"]
     roots = [write_dataset(tmp_path / str(i), names=other) for i, other in enumerate(
         (names, ["elbow", "shoulder", "gripper"], {"motors": names}, ["hip", "knee", "toe"]))]  # fmt: skip
-    with pytest.raises(
-        UserError, match=r"another order\. the source 0: shoulder, elbow.*the source 1: elbow, shoulder"
-    ):
+    with pytest.raises(UserError, match=r"another order\. the source 0: shoulder, elbow.*the source 1: elbow"):
         open_sources([str(roots[0]), str(roots[1])], own_robot())
     assert len(open_sources([str(roots[0]), str(roots[2])], own_robot())) == 2
     assert not caplog.text

@@ -67,7 +67,7 @@ def test_the_benchmarks_robots_take_goals_as_they_are_given(tmp_path: Path) -> N
 
 def test_the_rule_can_be_chosen_and_a_wrong_word_is_named() -> None:
     assert ids(own_processor(goal_case="given"), GOAL) != ids(own_processor(), GOAL)
-    with pytest.raises(UserError, match="processor.goal_case='upper'"):
+    with pytest.raises(UserError, match=r"processor.goal_case='upper'"):
         own_processor(goal_case="upper")
 
 
