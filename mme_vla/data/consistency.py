@@ -503,6 +503,26 @@ def compare_stats(root: Path, name: str, least: np.ndarray, greatest: np.ndarray
         )  # fmt: skip
 
 
+LARGEST_IN = {"rad": 20.0, "m": 20.0}
+"""What no robot reaches in a unit: three turns of a joint, twenty metres. Degrees and millimetres go beyond."""
+
+
+def compare_units(root: Path, names: Sequence[str], units: Sequence[str], scales: np.ndarray) -> None:
+    """Warn of numbers far too large for the unit that the robot's description gives them.
+
+    Args:
+        names, units: of each number. scales: the greatest size of each, [w].
+    """
+    beyond = [d for d, unit in enumerate(units) if scales[d] > LARGEST_IN.get(unit.strip().casefold(), np.inf)]
+    if beyond:
+        d = beyond[0]
+        log.warning(
+            "%s: the action's %s reaches %.4g, which is hardly in %s, as embodiment.action.units says (%d such numbers). "
+            "Correct the units, or convert the data.",
+            root, names[d], scales[d], units[d], len(beyond),
+        )  # fmt: skip
+
+
 def named_alike(name: str) -> str:
     """A number's name as names are compared: `Joint_1` is `joint 1`."""
     return "".join(letter for letter in name.casefold() if letter.isalnum())

@@ -14,7 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.consistency import Description, check_consistency, check_mode, compare_names, compare_stats
+from mme_vla.data.consistency import (
+    Description,
+    check_consistency,
+    check_mode,
+    compare_names,
+    compare_stats,
+    compare_units,
+)
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.lerobot_files import (
     REMEDY,
@@ -122,6 +129,7 @@ class EpisodeSource:
                 greatest_sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
             if greatest_sizes:
                 self.scales[kind] = np.concatenate(greatest_sizes)
+        compare_units(self.root, self.robot.action.names, self.robot.action.units, self.scales["action"])
         pictures = tuple(column for column in self.columns.values() if column not in video_columns)
         description = Description(self.root, info, episodes, self.fps, video_columns, tuple(dict.fromkeys(pictures)))
         self.tasks = check_consistency(description, self._table)

@@ -419,6 +419,14 @@ def test_sources_of_other_rates_and_other_units_are_noticed(tmp_path: Path, capl
     assert "The state of first and of second seem to have different units" in caplog.text
 
 
+def test_numbers_too_large_for_the_robots_unit_are_noticed(tmp_path: Path, caplog) -> None:
+    write_dataset(tmp_path, states=np.full((9, 3), 90.0))
+    opened(tmp_path, units=["deg", "", "mm"])
+    assert not caplog.text
+    opened(tmp_path, units=["rad", "", "m"])
+    assert "the action's number 1 reaches 90.1, which is hardly in rad" in caplog.text and "(2 such" in caplog.text
+
+
 # Layout and caches
 
 

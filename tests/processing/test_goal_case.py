@@ -71,15 +71,15 @@ def test_the_rule_can_be_chosen_and_a_wrong_word_is_named() -> None:
         own_processor(goal_case="upper")
 
 
-def test_an_episode_without_a_goal_is_refused_when_it_acts() -> None:
+def test_an_episode_without_a_goal_is_refused_when_its_prompt_is_made() -> None:
     policy = small_policy("pi05")
     episode = policy.start_episode("")  # environments give it later
     image = np.zeros((1, 32, 32, 3), np.uint8)
     episode.observe(dict.fromkeys(policy.embodiment.camera_names, image), np.zeros((1, 8), np.float32))
     with pytest.raises(UserError, match=r"The goal is ''"):
-        episode.act()
+        _ = episode.prompt
     episode.goal = "press the button"
-    assert episode.act() is not None
+    assert len(episode.prompt[0]) == len(policy.require_processor().prompt("press the button")[0])
 
 
 @pytest.mark.parametrize("goal", ["", "   ", ["", "press the button"]])
