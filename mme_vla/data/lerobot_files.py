@@ -348,7 +348,7 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
 
 def _listed_tasks(meta: Path, episode: int, cell: Any) -> tuple[str, ...]:
     """The tasks of an episode: LeRobot writes a list of texts; one text alone, an empty list or nothing is read too."""
-    texts = [cell] if isinstance(cell, str) else list(cell or ())
+    texts = list(cell or ()) if isinstance(cell, list | None) else [cell]
     if not all(isinstance(text, str) for text in texts):
         raise UserError(f"{meta}: tasks of episode {episode} is {brief(cell)}; expected a list of texts. {REMEDY}")
     return tuple(texts)
