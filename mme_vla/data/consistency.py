@@ -517,7 +517,7 @@ def compare_units(root: Path, names: Sequence[str], units: Sequence[str], scales
     if beyond:
         d = beyond[0]
         log.warning(
-            "%s: the action's %s reaches %.4g, which is hardly in %s, as embodiment.action.units says (%d such numbers). "
+            "%s: the action's %s reaches %.4g, which is hardly in %s, as embodiment.action.units says (%d such). "
             "Correct the units, or convert the data.",
             root, names[d], scales[d], units[d], len(beyond),
         )  # fmt: skip
