@@ -102,7 +102,7 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
     for episode in range(min(len(source), most)):
         frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
-        goal, seconds = printable(source.goal(episode)), f"{frames / source.fps:.1f}"
+        goal, seconds = printable(" → ".join(source.goals(episode))), f"{frames / source.fps:.1f}"
         table.add_row(str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal)
     if len(source) > most:
         table.add_row("…", f"{len(source) - most} more")
@@ -132,7 +132,7 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
     table.add_row("task", printable(source.task(episode)))
-    table.add_row("goal", printable(source.goal(episode)))
+    table.add_row("goal", printable(source.goal(episode, step)))
     table.add_row("video", f"frames 0 … {start - 1}" if start else "none")
     table.add_row("execution", f"frames {start} … {length - 1}")
     for name, text in source.subgoals(episode, step).items():
@@ -189,7 +189,7 @@ def draw_memory(
     _show(table, console)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
-    title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
+    title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode, step)}"
     start = int(source.exec_starts[episode])
     memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path

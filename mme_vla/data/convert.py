@@ -19,7 +19,7 @@ import numpy as np
 from mme_vla.data.console import progress, quiet_libraries
 from mme_vla.data.hdf5 import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame, open_episode, recorded_options
 from mme_vla.data.keyframes import file_of, write_keyframes
-from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX, SIDE_FILE
+from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX, SIDE_FILE, parquet_files
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError, did_you_mean, require
@@ -52,7 +52,7 @@ def _columns(root: Path) -> dict[str, list[Any]]:
     import pyarrow.parquet as pq
 
     tables = []
-    for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
+    for file in parquet_files(root, "meta/episodes"):
         names = [name for name in pq.read_schema(file).names if not name.startswith("stats/")]
         tables.append(pq.read_table(file, columns=names))
     columns: dict[str, list[Any]] = pa.concat_tables(tables).to_pydict()

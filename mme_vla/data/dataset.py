@@ -225,7 +225,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             episode=episode,
             index=frame,
             exec_start=int(source.exec_starts[episode]),
-            goal=source.goal(episode),
+            goal=source.goal(episode, frame),
             subgoals=source.subgoals(episode, frame),
             state=source.states(episode, frame, frame + 1)[0],
             actions=actions,

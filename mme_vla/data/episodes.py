@@ -14,15 +14,25 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.consistency import (
+    Description,
+    check_consistency,
+    check_mode,
+    compare_names,
+    compare_stats,
+    compare_units,
+)
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.lerobot_files import (
     REMEDY,
     RENDERED_SUFFIX,
     SAMPLE,
     SIDE_FILE,
+    TASKS,
     check_vectors,
     content_fingerprint,
     find_columns,
+    flat,
     lossy_coding,
     names_of,
     open_table,
@@ -36,8 +46,8 @@ from mme_vla.data.lerobot_files import (
 from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
-from mme_vla.embodiment.action_space import read_options
-from mme_vla.errors import UserError, brief, did_you_mean, require
+from mme_vla.embodiment.action_space import numbered, read_options
+from mme_vla.errors import UserError, brief, did_you_mean, listed, require
 from mme_vla.utils import Sums, decoding, read_json
 
 log = logging.getLogger(__name__)
@@ -48,7 +58,9 @@ class EpisodeSource:
 
     name: short name (the folder's, or `sample`). fps: frames per second.
     robot: whose columns are read. columns: the dataset's column of each camera.
-    state_names: what the dataset calls the numbers of the state; may be empty. Those of the action are the robot's.
+    state_names, action_names: what the dataset calls the numbers of the state and of the action; may be empty.
+    tasks: which task each frame has.
+    scales: of the state and of the action, the greatest size of each number, [w] float64.
     lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0 without a video).
     """
 
@@ -60,7 +72,7 @@ class EpisodeSource:
         max_open_videos: int = 512,
         robot: Embodiment = ROBOMME_JOINT,
     ) -> None:
-        """Open a dataset; nothing is downloaded.
+        """Open a dataset and compare it with itself (`consistency`); nothing is downloaded.
 
         Args:
             root: folder of a LeRobot v3.0 dataset, or `sample`.
@@ -69,6 +81,9 @@ class EpisodeSource:
             name: short name, which the validation split and the cache folder use; by default the folder's.
             max_open_videos: most video files kept open.
             robot: says which columns hold its images, states and actions.
+
+        Raises:
+            UserError: a file is missing or damaged, the dataset does not fit the robot or contradicts itself.
         """
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
@@ -76,8 +91,9 @@ class EpisodeSource:
         features = info["features"]
         matches = find_columns(self.root, features, robot)
         self.state_names = names_of([features[column] for column in matches.state])
-        action_names = names_of([features[column] for column in matches.action])
-        self.robot = replace(robot, action=robot.action.with_names(action_names))
+        self.action_names = names_of([features[column] for column in matches.action])
+        self._compare_names(robot)
+        self.robot = replace(robot, action=robot.action.with_names(self.action_names))
         columns, self.columns = list(matches.tables), matches.cameras
         self.fps = float(info["fps"])
         if robot.fps is not None and robot.fps != self.fps:
@@ -96,16 +112,27 @@ class EpisodeSource:
         opened = ("meta/", "data/") if len(videos) == len(self.columns) else ("meta/",)
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
         sums.check(*(name for name in sums.table if name.startswith(opened)))
-        episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
+        video_columns = tuple(dict.fromkeys(videos.values()))
+        episodes = read_episode_table(self.root, video_columns)
         self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
-        self._goals = list(episodes["goals"])
-        self._episodes, self._video_path = episodes, info.get("video_path")
+        self._episodes: dict[str, Any] = episodes
+        self._video_path = info.get("video_path")
         self._table = open_table(self.root, columns, features)
         self._reader = VideoReader(max_open_videos)
         self._check_rows()
-        for vectors in self._vectors_of.values():
+        self.scales: dict[str, np.ndarray] = {}
+        for kind, vectors in self._vectors_of.items():
+            greatest_sizes = []
             for name, width in vectors.items():
-                check_vectors(self.root, self._table, name, width)
+                least, greatest = check_vectors(self.root, self._table, name, width)
+                compare_stats(self.root, name, least, greatest)
+                greatest_sizes.append(np.maximum(np.abs(least), np.abs(greatest)))
+            if greatest_sizes:
+                self.scales[kind] = np.concatenate(greatest_sizes)
+        compare_units(self.root, self.robot.action.names, self.robot.action.units, self.scales["action"])
+        pictures = tuple(column for column in self.columns.values() if column not in video_columns)
+        description = Description(self.root, info, episodes, self.fps, video_columns, tuple(dict.fromkeys(pictures)))
+        self.tasks = check_consistency(description, self._table)
         self._rendered = {
             name: self._column(f"{name}{RENDERED_SUFFIX}").astype(bool)
             for name in self.columns
@@ -121,8 +148,14 @@ class EpisodeSource:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of the dataset's content, the same wherever the folder lies."""
-        return content_fingerprint(self.root)
+        """Hash of the dataset's content, the same wherever the folder lies.
+
+        The table of tasks counts where meta/episodes does not name the one task of every episode.
+        """
+        parts = ["data", "videos", "meta/episodes"]
+        if any(len(texts) != 1 for texts in self._episodes["tasks"]):
+            parts.append(TASKS)
+        return content_fingerprint(self.root, parts)
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
@@ -163,9 +196,26 @@ class EpisodeSource:
         sums.check(*sums.table)
         return len(sums.table)
 
-    def goal(self, episode: int) -> str:
-        """The episode's goal in words, lower-case."""
-        return self._goals[episode]
+    def goal(self, episode: int, frame: int | None = None) -> str:
+        """The goal of a frame in words, lower-case; without a frame, of an episode whose frames all have the same.
+
+        Raises:
+            UserError: no frame is given, and the episode has several tasks; they are named.
+        """
+        if frame is not None:
+            return self.tasks.at(int(self._starts[episode]) + frame)
+        goals = self.goals(episode)
+        require(
+            len(goals) == 1,
+            f"{self.name}: the frames of episode {episode} have {len(goals)} tasks: {listed(map(repr, goals))}. What "
+            "was asked for needs an episode of one task: choose another, or split it at the change of task_index.",
+        )
+        return goals[0]
+
+    def goals(self, episode: int) -> tuple[str, ...]:
+        """The different goals of an episode's frames, lower-case, in the order in which they begin."""
+        start = int(self._starts[episode])
+        return self.tasks.within(start, start + int(self.lengths[episode]))
 
     def options(self, episode: int) -> tuple[Option, ...]:
         """What the robot could choose among in an episode; none where it does not choose."""
@@ -268,7 +318,7 @@ class EpisodeSource:
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
         """The subgoal texts of one step, lower-case, under the names in `subgoal_names`."""
         row = self._rows(episode, step, step + 1)
-        texts = {name: _flat(row[name])[0].as_py() for name in self.subgoal_names}
+        texts = {name: flat(row[name])[0].as_py() for name in self.subgoal_names}
         for name, text in texts.items():
             require(
                 text is not None, f"{self.root}: {name} of frame {step} of episode {episode} has no value. {REMEDY}"
@@ -299,7 +349,10 @@ class EpisodeSource:
 
         cells = [self._table[start + int(i) : start + int(i) + 1][column][0].as_py() for i in indices]
         with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
-            return np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB")) for cell in cells])
+            pictures = [Image.open(io.BytesIO(cell["bytes"])) for cell in cells]
+            for picture in pictures:
+                check_mode(self.root, column, picture)
+            return np.stack([np.asarray(picture.convert("RGB")) for picture in pictures])
 
     def _rows(self, episode: int, start: int, stop: int | None) -> Any:
         length = int(self.lengths[episode])
@@ -312,14 +365,29 @@ class EpisodeSource:
     def _vectors(self, kind: str, episode: int, start: int, stop: int | None) -> np.ndarray:
         rows = self._rows(episode, start, stop)
         parts = [
-            _flat(rows[name]).to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, width)
+            flat(rows[name]).to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, width)
             for name, width in self._vectors_of[kind].items()
         ]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
+    def _compare_names(self, robot: Embodiment) -> None:
+        """Compare the names of numbers: the dataset's with the robot's, and of states with actions relative to them."""
+        own = robot.action.names if robot.action.names != numbered(robot.action.width) else ()
+        compare_names(
+            self.action_names, own, "action", f"the dataset {self.name}", f"the robot {robot.name}",
+            "Order embodiment.action.names as the dataset's column is, or choose the robot that recorded it.",
+        )  # fmt: skip
+        relative = [i for i in robot.action.relative if i < min(len(self.state_names), len(self.action_names))]
+        compare_names(
+            [self.state_names[i] for i in relative], [self.action_names[i] for i in relative],
+            f"state and action of {self.name}, subtracted from each other", "state", "action",
+            "A number is predicted relative to the state's number at the same place: record both in one order, or set "
+            "embodiment.action.relative=[].",
+        )  # fmt: skip
+
     def _check_rows(self) -> None:
         """The tables hold the episodes back to back, as the metadata say."""
-        index = _flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
+        index = flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
         total = int(self.lengths.sum())  # before anything of that size is made
         expected = np.repeat(np.arange(len(self)), self.lengths) if len(index) == total else None
         require(
@@ -359,12 +427,4 @@ class EpisodeSource:
         return starts
 
     def _column(self, name: str) -> np.ndarray:
-        return _flat(self._table.select_columns(name)[:][name]).to_numpy(zero_copy_only=False)
-
-
-def _flat(column: Any) -> Any:
-    """A column of an arrow table as one flat array; columns of one number may be stored as lists of one."""
-    array = column.combine_chunks() if hasattr(column, "combine_chunks") else column
-    while hasattr(array, "flatten") and getattr(array.type, "num_fields", 0) == 1 and hasattr(array.type, "value_type"):
-        array = array.flatten()
-    return array
+        return flat(self._table.select_columns(name)[:][name]).to_numpy(zero_copy_only=False)

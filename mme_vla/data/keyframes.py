@@ -215,6 +215,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         longest = 0
         for number, (source, part) in enumerate(zip(sources, selected, strict=True)):
             for episode in map(int, part):
+                source.goal(episode)  # a sample has one: an episode of several is refused here, not while training
                 self.total_frames += int(source.lengths[episode])
                 keyframes = EpisodeKeyframes(file_of(source.root, episode))
                 chains = [chain for chain in keyframes.chains if len(chain) >= length]
@@ -258,7 +259,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         number, episode, keyframes, links = self.window(index)
         frames = [link.frame for link in links]
         sample = KeyframeSample(
-            goal=self.sources[number].goal(episode),
+            goal=self.sources[number].goal(episode),  # one for the whole chain, or an error that names them
             shots=keyframes.shots(frames),
             open=keyframes.commanded_open(frames),
             places=np.array([link.place for link in links]),

@@ -1,5 +1,6 @@
 """The `data` section of a configuration → open datasets."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -7,10 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.consistency import compare_names
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, did_you_mean, require
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -95,4 +99,51 @@ def open_sources(
     names = [source.name for source in sources]
     if len(set(names)) < len(names):
         raise UserError(f"Two data sources have the same name ({', '.join(names)}); give one a `name` of its own.")
+    for other in sources[1:]:
+        compare_sources(sources[0], other)
     return sources
+
+
+UNITS_APART = 20
+"""How many times larger one source's numbers are than the other's where units differ: 57 from radians to degrees."""
+
+
+def compare_sources(first: EpisodeSource, second: EpisodeSource) -> None:
+    """Compare two datasets that are trained on together.
+
+    Other rates and other sizes of numbers (degrees beside radians) are a warning: both may be meant.
+
+    Raises:
+        UserError: their numbers have the same names in another order.
+    """
+    for kind, ours, theirs in (
+        ("state", first.state_names, second.state_names),
+        ("action", first.action_names, second.action_names),
+    ):
+        compare_names(
+            ours, theirs, kind, f"the source {first.name}", f"the source {second.name}",
+            "Trained together, one number would mean two things: bring one dataset's columns into the other's order.",
+        )  # fmt: skip
+        _compare_scales(first, second, kind)
+    if first.fps != second.fps:
+        log.warning(
+            "The source %s has %g frames per second, %s has %g: one step of a chunk is another time in each.",
+            first.name, first.fps, second.name, second.fps,
+        )  # fmt: skip
+
+
+def _compare_scales(first: EpisodeSource, second: EpisodeSource, kind: str) -> None:
+    ours, theirs = first.scales[kind], second.scales[kind]
+    moving = (ours > 0) & (theirs > 0)
+    if not moving.any():
+        return
+    ratios = np.log(ours[moving] / theirs[moving])
+    apart = float(np.exp(np.median(ratios)))
+    if max(apart, 1 / apart) < UNITS_APART:
+        return
+    d = int(np.flatnonzero(moving)[int(np.argmin(np.abs(ratios - np.median(ratios))))])
+    log.warning(
+        "The %s of %s and of %s seem to have different units: number %d reaches %.4g in one and %.4g in the other "
+        "(degrees beside radians differ by 57). Statistics are computed over both; convert one if that is not meant.",
+        kind, first.name, second.name, d + 1, ours[d], theirs[d],
+    )  # fmt: skip

@@ -1,6 +1,8 @@
 """Normalisation statistics of the training data, over the samples a policy trains on."""
 
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -9,8 +11,18 @@ from torch import Tensor
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.errors import require
-from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats, normalize
+from mme_vla.errors import UserError, check_choice, require
+from mme_vla.processing.normalise import (
+    ExactStats,
+    NormStats,
+    QuantileStats,
+    RunningStats,
+    narrow_numbers,
+    normalize,
+    widened,
+)
+
+log = logging.getLogger(__name__)
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 
@@ -26,6 +38,7 @@ def compute_norm_stats(
     extremes: bool = False,
     exact: bool = False,
     video: bool = False,
+    narrow: str = "warn",
 ) -> NormStats:
     """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are predicted.
 
@@ -41,7 +54,9 @@ def compute_norm_stats(
         every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
         exact: quantiles of all rows at once (linear interpolation), not of their histogram.
         video: count the conditioning video's steps too.
+        narrow: what to do about a number whose range the values leave by far (`check_ranges`).
     """
+    check_choice("narrow", narrow, NARROW)
     steps = _counted_steps(sources, episodes, video)
     require(len(steps) >= 2, f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
     if not every:
@@ -61,7 +76,102 @@ def compute_norm_stats(
     for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
         for place in robot.action.choice if name in values else ():  # a letter that is seldom chosen has no range
             values[name][place] = value
-    return NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
+    stats = NormStats(state=states.result(extremes), actions=QuantileStats.from_dict(values))
+    return check_ranges(stats, sources, episodes, horizon, action_offset, robot, video, narrow)
+
+
+NARROW = ("refuse", "warn", "widen", "ignore")
+"""What can be done about a range that is far too narrow; `ignore` does not look, for policies that do not need it."""
+
+
+def check_ranges(
+    stats: NormStats,
+    sources: Sequence[EpisodeSource],
+    episodes: Sequence[np.ndarray] | None = None,
+    horizon: int = 20,
+    action_offset: int = 0,
+    robot: Embodiment = ROBOMME_JOINT,
+    video: bool = False,
+    narrow: str = "refuse",
+) -> NormStats:
+    """Compare statistics with the extremes of what they normalise: every state, and every action of every chunk.
+
+    A number that never moves is in order. One that moves in so few samples that its quantiles do not show it, or that
+    has values beyond `NARROW_RANGES` ranges, gives the loss targets of many thousands.
+
+    Args:
+        stats: of any data. The others are as in `compute_norm_stats`.
+        narrow: `refuse`; `warn`; or `widen`, which makes the range of such a number reach to its extremes.
+
+    Returns:
+        The statistics, widened if asked to.
+
+    Raises:
+        UserError: a range is too narrow, and `narrow` is `refuse`. It names the number, its range and its extremes.
+    """
+    check_choice("narrow", narrow, NARROW)
+    if narrow == "ignore":
+        return stats
+    state, actions = _extremes(sources, episodes, horizon, action_offset, robot, video)
+    names = {"state": sources[0].state_names, "actions": sources[0].robot.action.names}
+    changed = {}
+    for kind, ends in (("state", state), ("actions", actions)):
+        of = getattr(stats, kind)
+        places = [place for place in narrow_numbers(of, *ends) if kind == "state" or place not in robot.action.choice]
+        if not places:
+            continue
+        lines = []
+        for place in places:
+            name = names[kind][place] if place < len(names[kind]) else f"number {place + 1}"
+            lines.append(
+                f"{name} of the {kind.removesuffix('s')} has q01 {of.q01[place]:.6g} and q99 {of.q99[place]:.6g}, but "
+                f"values from {ends[0][place]:.6g} to {ends[1][place]:.6g}"
+            )
+        told = "; ".join(lines)
+        if narrow == "widen":
+            log.warning("%s. Its range is widened to these values.", told)
+            changed[kind] = widened(of, places, *ends)
+            continue
+        message = (
+            f"{told}. Normalised by such a range they become numbers in the hundreds to millions, and the loss with "
+            "them. If they are broken readings, correct the data. If the number seldom moves, set "
+            "data.narrow_ranges=widen: its range then reaches from the least to the greatest value."
+        )
+        if narrow == "refuse":
+            raise UserError(message)
+        log.warning("%s", message)
+    return replace(stats, **changed)
+
+
+def _extremes(
+    sources: Sequence[EpisodeSource],
+    episodes: Sequence[np.ndarray] | None,
+    horizon: int,
+    action_offset: int,
+    robot: Embodiment,
+    video: bool,
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Least and greatest of the states, [s] each, and of the actions as they are predicted, [w] each."""
+    found: dict[str, list[np.ndarray]] = {"state": [], "actions": []}
+    for i, source in enumerate(sources):
+        for number in range(len(source)) if episodes is None else episodes[i]:
+            episode = int(number)
+            length = int(source.lengths[episode])
+            steps = np.arange(length) if video else np.asarray(source.decisions(episode), np.int64)
+            if not len(steps):
+                continue
+            states = source.states(episode)[steps]
+            found["state"] += [states.min(axis=0), states.max(axis=0)]
+            if robot.action.frames is None:
+                chunks = np.stack([source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps])
+            else:
+                later = steps[:, None] + action_offset + np.arange(horizon)
+                chunks = source.actions(episode)[np.minimum(later, length - 1)]
+                for place in robot.action.of_pose:
+                    chunks[..., place][later >= length] = 0  # as `action_chunk` has them past the end
+            relative = robot.action.to_relative(torch.from_numpy(chunks), torch.from_numpy(states)).numpy()
+            found["actions"] += [relative.min(axis=(0, 1)), relative.max(axis=(0, 1))]
+    return tuple((np.min(ends, axis=0), np.max(ends, axis=0)) for ends in found.values())  # type: ignore[return-value]
 
 
 def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:

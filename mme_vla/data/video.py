@@ -64,17 +64,27 @@ class VideoReader:
         tolerance, near = 0.5 / fps, _SEEK_BEYOND / fps
         frames: Iterator[Any] = iter(())
         time, image = -np.inf, None
+        ahead: Any = None  # the image after `image`, where it was decoded already
         for target in targets:
             if target > time + near or target < time - tolerance or image is None:
                 # One tick early, so that rounding never lands behind the image's own key frame.
                 container.seek(max(round(target / stream.time_base) - 1, 0), stream=stream)
                 frames = container.decode(stream)
-                time, image = -np.inf, None
+                time, image, ahead = -np.inf, None, None
             while time < target - tolerance:
-                frame = next(frames, None)
+                frame = next(frames, None) if ahead is None else ahead
+                ahead = None
                 if frame is None:
                     return
                 time, image = float(frame.pts * stream.time_base), frame
+            while target - time > tolerance / 2:  # of a video with more images a second, the next may be nearer
+                ahead = next(frames, None) if ahead is None else ahead
+                if ahead is None:
+                    break
+                next_time = float(ahead.pts * stream.time_base)
+                if next_time - target >= target - time:
+                    break
+                time, image, ahead = next_time, ahead, None
             if time > target + tolerance or image is None:
                 return
             yield image.to_ndarray(format="rgb24")

@@ -16,7 +16,7 @@ from mme_vla.policy.capabilities import with_vision_memory
 from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
 from mme_vla.processing.normalise import check_reach, finite_array
-from mme_vla.processing.prompt import checked_text
+from mme_vla.processing.prompt import checked_goal, checked_text
 from mme_vla.speed.rtc import overlap_weights
 from mme_vla.types import FrameBatch, HistoryTokens, Overlap, PastViews
 
@@ -254,7 +254,7 @@ class Episode:
     def prompt(self) -> Any:
         """The processor's encoding of goal and subgoal."""
         processor, state = self._policy.require_processor(), self._recent[-1][1] if self._recent else None
-        goal = self._robot.action.worded(self.goal, self.options)
+        goal = self._robot.action.worded(checked_goal(self.goal), self.options)
         notes = {"notes": self.notes} if processor.prompt_spec.notes else {}
         return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed, **notes)
 

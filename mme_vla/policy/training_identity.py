@@ -15,7 +15,7 @@ NONE = "none"
 """What `init_from` says for random weights."""
 _RECIPE = ("train", "finetune", "learning", "init_from")
 _POLICY = ("augment", "compute_dtype", "stage", "subtask_weight")
-_DATA = ("action_offset", "mask_padding", "jitter", "history_transforms", "weights", "texts")
+_DATA = ("action_offset", "mask_padding", "jitter", "history_transforms", "weights", "texts", "narrow_ranges")
 _NO_EFFECT = (
     "train.log_every", "train.val_every", "train.val_samples", "train.save_every", "train.keep", "train.parallel",
     "train.prefetch_gb", "train.workers", "train.open_loop_chunks", "train.device", "train.seed",

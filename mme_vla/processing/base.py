@@ -97,12 +97,14 @@ class StatsSpec:
     every: every execution step once, in the data's order; else shuffled batches without an incomplete last one, as the
         released code of π0.5 does.
     extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a histogram.
+    bounds: what becomes −1 and 1, `quantiles` or `extremes`.
     video: include the steps of the conditioning video.
     """
 
     horizon: int | None = None
     every: bool = False
     extremes: bool = False
+    bounds: str = "quantiles"
     exact: bool = False
     video: bool = False
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -175,6 +175,54 @@ class ExactStats:
         return QuantileStats(rows.mean(0), rows.std(0), q01, q99, *ends)
 
 
+FEWEST_BINS = 50
+"""Of a running histogram between the two quantiles; with fewer a quantile is off by more than 2 % of the range."""
+
+
+class _Magnitudes:
+    """A histogram of one number whose bins grow with the distance from a centre: one part in 512 of each power of two.
+
+    Its bins are the same whatever comes later, so one value far away costs the others nothing. They are found by
+    taking numbers apart, not by a logarithm, so they are the same on every machine.
+    """
+
+    PARTS, LEAST, MOST = 256, -60, 132  # bins of a power of two, and the powers: 1e-18 to 5e39
+
+    def __init__(self, centre: float) -> None:
+        """Begin around a value near which most others are expected."""
+        self._centre = float(centre)
+        self._above = np.zeros((self.MOST - self.LEAST) * self.PARTS, np.int64)
+        self._below = np.zeros_like(self._above)
+        self._at_centre = self._count = 0
+
+    def update(self, values: np.ndarray) -> None:
+        """Count values [n]."""
+        distances = values - self._centre
+        mantissas, powers = np.frexp(np.abs(distances))
+        parts = ((2 * mantissas - 1) * self.PARTS).astype(np.int64)
+        bins = (np.clip(powers, self.LEAST, self.MOST - 1) - self.LEAST) * self.PARTS + np.maximum(parts, 0)
+        np.add.at(self._above, bins[distances > 0], 1)
+        np.add.at(self._below, bins[distances < 0], 1)
+        self._at_centre += int((distances == 0).sum())
+        self._count += len(values)
+
+    def quantile(self, q: float) -> float:
+        """The quantile as numpy's, between the two values nearest to it, each the middle of its bin."""
+        below = np.concatenate([self._below[::-1], [self._at_centre], self._above]).cumsum()
+        rank = q * (self._count - 1)
+        low, high = (self._value(below, int(side)) for side in (np.floor(rank), np.ceil(rank)))
+        return low + (high - low) * (rank - np.floor(rank))
+
+    def _value(self, below: np.ndarray, rank: int) -> float:
+        """About the value of a rank from 0; below: counts of values up to each bin, from the lowest on."""
+        place = int(np.searchsorted(below, rank, side="right")) - len(self._below)
+        if place == 0:
+            return self._centre
+        power, part = divmod(abs(place) - 1, self.PARTS)
+        distance = np.ldexp(0.5 + (part + 0.5) / (2 * self.PARTS), power + self.LEAST)
+        return float(self._centre + np.sign(place) * distance)
+
+
 class RunningStats:
     """Mean, deviation and quantiles of a stream too long to keep, in one pass.
 
@@ -182,6 +230,9 @@ class RunningStats:
     bin's count moves to the new bin that holds its left edge. A quantile q is the left edge of the first bin at which
     the cumulative count reaches q·n. All as released, so that the same data give the same `norm_stats.json`: also that
     a first bin whose edge lies a hair outside the new range loses its count, so quantiles are approximate.
+
+    One value far away makes all bins wide, and the others fall into one. Where fewer than `FEWEST_BINS` lie between the
+    quantiles, they are taken from a second histogram (`_Magnitudes`), whose bins nothing widens.
     """
 
     def __init__(self, bins: int = BINS) -> None:
@@ -190,6 +241,7 @@ class RunningStats:
         empty: np.ndarray = np.zeros(0)
         self._mean = self._square = self._low = self._high = empty  # [d]
         self._edges = self._counts = empty  # [d, bins + 1] and [d, bins]
+        self._magnitudes: list[_Magnitudes] = []  # [d]
 
     @property
     def count(self) -> int:
@@ -210,6 +262,7 @@ class RunningStats:
             # A hair of room, so that a dimension that never moves still has bins.
             self._edges = np.linspace(low - 1e-10, high + 1e-10, self._bins + 1, axis=1)
             self._counts = np.zeros((rows.shape[1], self._bins))
+            self._magnitudes = [_Magnitudes(centre) for centre in np.median(rows, axis=0)]
         elif rows.shape[1] != len(self._mean):
             raise UserError(f"Rows of {rows.shape[1]} numbers cannot join statistics of {len(self._mean)}.")
         elif (low < self._low).any() or (high > self._high).any():
@@ -221,13 +274,21 @@ class RunningStats:
         self._square = self._square + ((rows**2).mean(0) - self._square) * weight
         for edges, counts, column in zip(self._edges, self._counts, rows.T, strict=True):
             counts += np.histogram(column, edges)[0]
+        for magnitudes, column in zip(self._magnitudes, rows.T, strict=True):
+            magnitudes.update(column)
 
     def result(self, extremes: bool = False) -> QuantileStats:
         """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
         require(self._count >= 2, f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
         ends = (self._low.copy(), self._high.copy()) if extremes else ()
-        return QuantileStats(self._mean.copy(), std, self._quantile(0.01), self._quantile(0.99), *ends)
+        low, high = self._quantile(0.01), self._quantile(0.99)
+        widths = (self._high - self._low) / self._bins
+        for d, magnitudes in enumerate(self._magnitudes):
+            fine_low, fine_high = magnitudes.quantile(0.01), magnitudes.quantile(0.99)
+            if 0 < fine_high - fine_low < FEWEST_BINS * widths[d]:
+                low[d], high[d] = fine_low, fine_high
+        return QuantileStats(self._mean.copy(), std, low, high, *ends)
 
     def _rebin(self) -> None:
         edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)
@@ -238,6 +299,28 @@ class RunningStats:
     def _quantile(self, q: float) -> np.ndarray:
         below = self._counts.cumsum(1) < q * self._count
         return self._edges[np.arange(len(below)), below.sum(1)]
+
+
+NARROW_RANGES = 100
+"""Ranges q01…q99 beyond which a value says that the range is not that of its number."""
+
+
+def narrow_numbers(stats: QuantileStats, least: np.ndarray, greatest: np.ndarray) -> list[int]:
+    """The numbers whose values lie more than `NARROW_RANGES` ranges q01…q99 below or above it.
+
+    Args:
+        least, greatest: the extremes of the values, [d].
+    """
+    reach = np.maximum(stats.q01 - least, greatest - stats.q99)
+    return np.flatnonzero(reach > NARROW_RANGES * (stats.q99 - stats.q01 + EPSILON)).tolist()
+
+
+def widened(stats: QuantileStats, places: list[int], least: np.ndarray, greatest: np.ndarray) -> QuantileStats:
+    """The same statistics, q01 and q99 of these numbers moved out to the extremes [d] of their values."""
+    low, high = stats.q01.copy(), stats.q99.copy()
+    low[places] = np.minimum(low[places], least[places])
+    high[places] = np.maximum(high[places], greatest[places])
+    return replace(stats, q01=low, q99=high)
 
 
 REACH = 100  # multiples of the widest range; a broken driver says 1e30, a robot never leaves its joints' limits by that

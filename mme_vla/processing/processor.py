@@ -12,7 +12,7 @@ from torch import Tensor
 from mme_vla.backbone.building import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, check_integer, did_you_mean, listed, require
+from mme_vla.errors import UserError, brief, check_choice, check_integer, did_you_mean, listed, require
 from mme_vla.processing.base import (
     CONFIG_FILE,
     STATS_FILE,
@@ -25,7 +25,16 @@ from mme_vla.processing.base import (
 )
 from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.normalise import NormStats, normalize, unnormalize
-from mme_vla.processing.prompt import PROMPTS, PromptInput, checked_text, encode_prompt, shorten
+from mme_vla.processing.prompt import (
+    GOAL_CASES,
+    PROMPTS,
+    PromptInput,
+    checked_text,
+    encode_prompt,
+    goal_case,
+    shorten,
+    spelled,
+)
 from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch
@@ -116,6 +125,8 @@ class Processor(PolicyProcessor):
         horizon: h; steps in a chunk; None for the embodiment's.
         embodiment: the robot: its cameras, in the order the network sees them, its state and its actions.
         stats: normalisation statistics; without them everything works but states and actions.
+        goal_case: `lower` spells every goal and subgoal as in training; `given` leaves them, as the benchmark's robots
+            and checkpoints from before there was a choice do.
     """
 
     def __init__(
@@ -129,7 +140,9 @@ class Processor(PolicyProcessor):
         embodiment: Embodiment = ROBOMME_JOINT,
         stats: NormStats | None = None,
         subgoal_length: int | None = None,
+        goal_case: str = "given",
     ) -> None:
+        check_choice("processor.goal_case", goal_case, GOAL_CASES)
         sizes = {
             "image_size": image_size,
             "prompt_length": prompt_length,
@@ -150,13 +163,16 @@ class Processor(PolicyProcessor):
         self.embodiment = embodiment if horizon is None else embodiment.with_horizon(horizon)
         self.embodiment.check_network(action_dim, self.embodiment.action.horizon)
         self.stats = stats
+        self.goal_case = goal_case
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
         backbone = shape_of(sections["backbone"])
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
+        robot = embodiment_of(sections)
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
-        processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
+        settings["goal_case"] = settings.get("goal_case") or goal_case(robot)
+        processor = cls.from_config({**settings, **sizes, "embodiment": robot.to_dict()})
         vocab_size = sections["backbone"].get("vocab_size")
         require(
             not (vocab_size is not None and processor.tokenizer.vocab_size > vocab_size),
@@ -229,7 +245,9 @@ class Processor(PolicyProcessor):
         if count and state is not None and past_actions is not None:
             recent = self.embodiment.action.to_relative(_float(past_actions)[-count:], _float(state))
             past = normalize(recent, self.require_stats().actions).numpy()
+        goal = spelled(checked_text(goal, "the goal"), self.goal_case)
         if subgoal is not None and self.prompt_format.reads_subgoal:
+            subgoal = spelled(checked_text(subgoal, "the subgoal"), self.goal_case)
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
         texts = {
             name: checked_text((notes or {}).get(name, ""), f"the note {name!r}") for name in self.prompt_format.notes
@@ -312,6 +330,8 @@ class Processor(PolicyProcessor):
             "action_dim": self.action_dim,
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
+            # Absent in files of earlier versions, which left goals as they were given.
+            **({"goal_case": self.goal_case} if self.goal_case != "given" else {}),
         }
 
     @classmethod

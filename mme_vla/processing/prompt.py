@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.config.sections import read_section
+from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, brief, check_choice, require
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import PROMPTS
@@ -166,6 +167,34 @@ def discretize(values: np.ndarray) -> list[int]:
     """Map each normalised number, clipped to [-1, 1], to its level 0…255."""
     edges = np.linspace(-1, 1, BINS + 1)[:-1]
     return (np.digitize(np.clip(values, -1, 1), edges) - 1).tolist()
+
+
+GOAL_CASES = ("given", "lower")
+"""How a goal is spelled when acting; in training goals are lower-case."""
+
+
+def goal_case(robot: Embodiment) -> str:
+    """How a new policy of this robot spells goals when acting.
+
+    A robot of one's own: as in training. The benchmark's: as they are given, as in the released code.
+    """
+    return "lower" if robot.action.space is None else "given"
+
+
+def spelled(text: str, case: str) -> str:
+    """A goal or subgoal in one of `GOAL_CASES`."""
+    return text.lower() if case == "lower" else text
+
+
+def checked_goal(text: object) -> str:
+    """`text`, if it can tell a policy what to do.
+
+    Raises:
+        UserError: it is no text, holds half a character, or nothing but spaces.
+    """
+    goal = checked_text(text, "the goal")
+    require(goal.strip(), f"The goal is {goal!r}: a policy is told what to do in words. Give the task as a text.")
+    return goal
 
 
 def checked_text(text: object, what: str) -> str:

@@ -195,7 +195,7 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
     state = _numbers("observation/state", _array(message, "observation/state"))
     if state.shape != (robot.state.width,):
         raise UserError(f"observation/state must be [{robot.state.width}], got {list(state.shape)}.")
-    goal, options = _text("prompt", _get(message, "prompt")), _options(message, robot)
+    goal, options = _goal("prompt", _get(message, "prompt")), _options(message, robot)
     if not robot.readings:
         return Infer(images, state, goal, _subgoals(message), options=options)
     readings = {f"observation/{name}": [_get(message, f"observation/{name}")] for name in robot.readings}
@@ -219,7 +219,7 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
         raise UserError(f"All lists need one entry a frame: {counts}.")
     first = _get(message, "is_first_step")
     require(isinstance(first, bool | np.bool_), f"is_first_step must be true or false, got {type(first).__name__}.")
-    goal = _text("task_goal", _get(message, "task_goal"))
+    goal = _goal("task_goal", _get(message, "task_goal"))
     states = np.stack([benchmark_state(*proprio) for proprio in zip(joints, grippers, strict=True)])
     images = {name: view[-1] for name, view in views.items()}
     frames, options = views[robot.memory_camera], _options(message, robot)
@@ -299,6 +299,12 @@ def _image(key: str, image: Any) -> np.ndarray:
     require(high <= 8 * low, f"{key}: an image {got} is too narrow to be scaled into a square.")
     checked: np.ndarray = image
     return checked
+
+
+def _goal(key: str, value: Any) -> str:
+    goal = _text(key, value)
+    require(goal.strip(), f"{key} is {goal[:40]!r}: a policy is told what to do in words. Send the task as a text.")
+    return goal
 
 
 def _text(key: str, value: Any) -> str:

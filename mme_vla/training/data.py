@@ -10,8 +10,8 @@ from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.dataset import GroupDataset, TrainingDataset
 from mme_vla.data.keyframes import KeyframeDataset
 from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
-from mme_vla.data.statistics import compute_norm_stats
-from mme_vla.errors import require
+from mme_vla.data.statistics import NARROW, compute_norm_stats
+from mme_vla.errors import check_choice, require
 from mme_vla.memory.transforms import build_transforms
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import TrainsOnKeyframes, WeighsLosses, with_vision_memory
@@ -59,10 +59,14 @@ def prepare_data(
         processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
         counted, horizon = processor.stats_spec, processor.embodiment.action.horizon
+        narrow = data.get("narrow_ranges") or "refuse"
+        check_choice("data.narrow_ranges", narrow, NARROW)
+        if counted.bounds == "extremes":
+            narrow = "ignore"  # nothing lies beyond them
         processor.stats = compute_norm_stats(
             sources, split.train, counted.horizon or horizon, offset, seed, policy.embodiment,
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
-            video=counted.video,
+            video=counted.video, narrow=narrow,
         )  # fmt: skip
     labels = labels_read(*(part for part in policy.children() if part is not policy.memory))
     require(

@@ -87,7 +87,7 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     kind = "held-out" if held_out else "training"
     data = samples.sources[source]
     return OpenLoop(
-        title=f"{kind} episode {episode} of {data.name}: “{data.goal(episode)}”",
+        title=f"{kind} episode {episode} of {data.name}: “{' → '.join(data.goals(episode))}”",
         steps=np.array([step.index for step in recorded]),
         predicted=torch.cat(predicted).numpy(),
         recorded=np.stack([step.actions for step in recorded]),

@@ -182,5 +182,5 @@ def selection_sheets(
         history.append(part, torch.zeros(len(history.to_encode(len(part))), patches, 1))
         n_observed = step + 1
         selected = memory.select(history, step)
-        title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
+        title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode, step)}"
         yield step, memory_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)

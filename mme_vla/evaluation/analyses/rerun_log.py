@@ -55,7 +55,7 @@ class RerunLog:
         self.at(episode, step)
         for view in source.robot.camera_names:
             self.log_image(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
-        self.words("goal", source.goal(episode))
+        self.words("goal", source.goal(episode, step))
         for kind, text in source.subgoals(episode, step).items():
             self.words(kind, text)
 

@@ -84,7 +84,7 @@ class DiffusionProcessor(GoalProcessor):
     """Images of one size without augmentation, states and actions between their extremes, and the goal's vector."""
 
     name, trusted = "diffusion_policy", (CLIP_NAME, HASHED)
-    stats_spec = StatsSpec(horizon=1, every=True, extremes=True)
+    stats_spec = StatsSpec(horizon=1, every=True, extremes=True, bounds=BY)
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from torch.nn import functional
 from mme_vla.config.sections import Positive, PositiveInt, Range, read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, check_choice
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.simplememvla.config import SimpleMemVlaSizes
 from mme_vla.methods.simplememvla.model import WordIds
@@ -45,6 +45,7 @@ from mme_vla.processing.base import (
 from mme_vla.processing.images import as_uint8_frames
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.processing.processor import saved_file
+from mme_vla.processing.prompt import GOAL_CASES, goal_case, spelled
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import HistoryTokens, TensorStruct
 
@@ -71,6 +72,7 @@ class PromptSettings:
     image_pixels: tuple[PositiveInt, PositiveInt] = (65_536, 16_777_216)
     max_words: Annotated[int, Range(1, 1024)] = 64
     max_tokens: PositiveInt = 8192
+    goal_case: str | None = None
 
 
 @dataclass
@@ -149,6 +151,8 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """
         self.settings, self.embodiment = settings, embodiment
         self.factor, self.memory_tokens, self.image_side = factor, memory_tokens, image_side
+        if settings.goal_case is not None:
+            check_choice("processor.goal_case", settings.goal_case, GOAL_CASES)
         if settings.side is not None and settings.side % factor:
             raise UserError(f"processor.side={settings.side} must be a multiple of {factor} pixels.")
         if settings.seconds * settings.fps > 4096:
@@ -170,8 +174,10 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         sizes = SimpleMemVlaSizes.from_dict(sections["backbone"])
         values = {key: value for key, value in sections["processor"].items() if key != "name"}
         settings = read_section(PromptSettings, values, "processor")
+        robot = embodiment_of(sections)
+        settings = replace(settings, goal_case=settings.goal_case or goal_case(robot))
         memory = (sections.get("memory") or {}).get("budget", 0)
-        built = cls(settings, embodiment_of(sections), sizes.factor, memory, sizes.image_size)
+        built = cls(settings, robot, sizes.factor, memory, sizes.image_size)
         rows = sizes.qwen.text_config.vocab_size
         if built.tokenizer.vocab_size > rows:
             raise UserError(
@@ -228,6 +234,7 @@ class SimpleMemVlaProcessor(PolicyProcessor):
         """The request that a prompt ends with; its tokens depend on what is shown (`tokens`)."""
         settings = self.settings
         robot = Robot(settings.robot, settings.control_hz, self.embodiment.action.horizon)
+        goal = spelled(goal, settings.goal_case or "given")  # not written by earlier versions
         return instruction(goal, robot, 1, len(self.embodiment.cameras) - 1)
 
     def tokens(

@@ -147,6 +147,9 @@ class ManyTasks:
     def task(self, episode: int) -> str:
         return self.tasks[episode]
 
+    def goal(self, episode: int) -> str:
+        return f"do {self.tasks[episode]}"
+
 
 def sampled_shares(
     episodes: dict[str, list[list[int]]], length: int, monkeypatch: pytest.MonkeyPatch
