@@ -79,6 +79,16 @@ class MMEModel(nn.Module):
         """
         return self.total_loss(self.losses(batch, noise, memory, augmentation))
 
+    def forward(
+        self,
+        batch: Batch,
+        noise: Mapping[str, Tensor],
+        memory: MemoryTokens | None = None,
+        augmentation: Tensor | None = None,
+    ) -> Tensor:
+        """The `loss`. What wraps a module (DDP, FSDP, `torch.compile`) acts when the module itself is called."""
+        return self.loss(batch, noise, memory, augmentation)
+
     def losses(
         self,
         batch: Batch,

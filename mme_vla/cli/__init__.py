@@ -5,6 +5,7 @@ import sys
 from importlib import import_module
 
 from mme_vla.cli.errors import print_user_errors
+from mme_vla.errors import UserError
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train a policy"),
@@ -33,6 +34,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Name on the command line → module of this package, and a line of help."""
 
 
+SHARED = {"train", "evaluate", "cache", "subgoal_train"}
+"""Modules of commands whose work several processes of a launcher share."""
+
 _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print
 
 
@@ -45,7 +49,25 @@ def run(module: str) -> None:
     # step tenfold. It counts only when set before PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with print_user_errors():
+        check_launcher(module)
         first = os.environ.get("LOCAL_RANK", "0") == "0"
         if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
             print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
         import_module(f"{__name__}.{module}").main()
+
+
+def check_launcher(module: str) -> None:
+    """Refuse to start a command in several processes that would each do all of its work.
+
+    Raises:
+        UserError: `torchrun` started this process beside others, and the command does not share its work.
+    """
+    processes = os.environ.get("WORLD_SIZE", "1")
+    if module in SHARED or not processes.isdecimal() or int(processes) <= 1:
+        return
+    name = next(name for name, (other, _) in COMMANDS.items() if other == module)
+    sharing = ", ".join(name for name, (other, _) in COMMANDS.items() if other in SHARED)
+    raise UserError(
+        f"WORLD_SIZE={processes}: `{name}` does not share its work among processes, so each would do all of it. Start "
+        f"it without a launcher. Commands that share their work: {sharing}."
+    )

@@ -1,5 +1,6 @@
 """`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
 
+import os
 import shlex
 import time
 from contextlib import ExitStack, nullcontext, suppress
@@ -94,6 +95,7 @@ def train(
     Raises:
         SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the signal's number.
     """
+    import torch
     from accelerate import Accelerator
     from accelerate.utils import DistributedDataParallelKwargs, broadcast_object_list
 
@@ -107,7 +109,10 @@ def train(
         find_device("cuda")  # says so where there is none
     # Where processes have all weights each, gradients lie in what is sent instead of being copied there.
     one_copy = DistributedDataParallelKwargs(gradient_as_bucket_view=True)
-    accelerator = Accelerator(cpu=settings.device == "cpu", kwargs_handlers=[one_copy])
+    # Accelerate joins processes on CPUs only where it is told that there is nothing else.
+    without_gpu = settings.device == "cpu" or not torch.accelerator.is_available()
+    accelerator = Accelerator(cpu=without_gpu, kwargs_handlers=[one_copy])
+    check_processes(accelerator.num_processes)
     selection: list[Any] = [None]
     with ExitStack() as resources:
         if accelerator.is_main_process:  # the clock is in the folder's name: the first process decides
@@ -122,6 +127,23 @@ def train(
         raise SystemExit(128 + trainer.stopped_by)
     assert trainer.last_checkpoint is not None
     return trainer.last_checkpoint
+
+
+def check_processes(joined: int) -> None:
+    """Make sure that the processes that a launcher started train one policy together.
+
+    Args:
+        joined: processes that Accelerate sees.
+
+    Raises:
+        UserError: they are fewer than the launcher started, so that each would train a policy of its own.
+    """
+    started = os.environ.get("WORLD_SIZE", "1")
+    require(
+        int(started) == joined,
+        f"WORLD_SIZE={started}, but {joined} of these processes train together: each would train a whole policy by "
+        "itself. Start the command without a launcher, or on CPUs with torchrun and train.device=cpu.",
+    )
 
 
 def _train(

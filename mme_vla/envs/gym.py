@@ -1,6 +1,8 @@
 """The tasks as plain Gymnasium environments, for libraries of reinforcement learning.
 
->>> gymnasium.make("mme_vla/StopCube-v0", images=False)  # doctest: +SKIP
+>>> gymnasium.make("mme_vla.envs.gym:mme_vla/StopCube-v0", images=False)  # doctest: +SKIP
+
+Importing this module registers the tasks, and Gymnasium imports what stands before the colon.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,10 +13,10 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE, benchmark_state
 from mme_vla.envs.interface import RoboMMEEnv
-from mme_vla.envs.make import make_env
-from mme_vla.envs.metadata import episodes
-from mme_vla.envs.registration import register_tasks
+from mme_vla.envs.make import load_tasks, make_env
+from mme_vla.envs.metadata import TASK_NAMES, episodes
 from mme_vla.errors import check_choice
+from mme_vla.registry import TASKS
 
 _POSITION, _ANGLE = 2.0, 2 * np.pi  # bounds of a commanded pose: metres and radians
 _LOWEST, _HIGHEST = (-2.9, -1.8, -2.9, -3.1, -2.9, -0.02, -2.9), (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9)
@@ -36,7 +38,7 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         action_space: `joint_angle`, `ee_pose` or `waypoint`.
         reward: `sparse`, `subtask` or `none`.
         images: whether frames are rendered; without, a step is about 80 times faster.
-        max_steps: steps until an episode is truncated; None: as many as the split allows.
+        max_steps: as in `make_env`, where the benchmark ends an episode at the step after it; None: of the split.
         render_mode: `rgb_array` with images, None without.
     """
 
@@ -62,7 +64,9 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         self._env: RoboMMEEnv | None = None
         self._number: int | None = None
         self._observation: dict[str, np.ndarray] = {}
-        self._stick = self._open(episode or 0).task.stick
+        # Asked of the class: a vector environment forks after this, and a renderer does not survive a fork.
+        load_tasks(task)
+        self._stick = TASKS[task].stick
         pose = [_POSITION] * 3 + [_ANGLE] * 3
         low, high = (_LOWEST, _HIGHEST) if action_space == "joint_angle" else ([-x for x in pose], pose)
         gripper = [] if self._stick else [1.0]
@@ -127,7 +131,10 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         goals = info.get("task_goal")
         status = str(info.get("status", ""))
         texts = {"goal": goals[0] if goals else "", "subgoal": str(info.get("simple_subgoal_online", ""))}
-        return {**texts, "status": status, "success": status == "success"}
+        reasons = {key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)}
+        return {**texts, **reasons, "status": status, "success": status == "success"}
 
 
-register_tasks()  # where the entry point is not installed, this import does it
+for _task in TASK_NAMES:
+    if f"mme_vla/{_task}-v0" not in gymnasium.registry:
+        gymnasium.register(id=f"mme_vla/{_task}-v0", entry_point="mme_vla.envs.gym:GymTask", kwargs={"task": _task})

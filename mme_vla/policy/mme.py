@@ -140,7 +140,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         """While training with augmentation `changes` [n, …]: random numbers that change a sample's images."""
         return {"changes": self._sample_augmentation(count, generator)} if self.training and self.augment else {}
 
-    def forward(
+    def forward(  # type: ignore[override]  # returns metrics too, as all policies do
         self,
         batch: Batch,
         noise: Mapping[str, Tensor] | Tensor | None = None,

@@ -1,7 +1,8 @@
 """The tasks as plain Gymnasium environments: Gymnasium's own check, and PPO of stable-baselines3."""
 
 import re
-import tomllib
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ pytest.importorskip("mani_skill", reason="the simulator is not installed: the ex
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 
-import mme_vla.envs.gym  # noqa: F401
+import mme_vla.envs.gym
 
 
 @pytest.mark.parametrize("task", ["StopCube", "PatternLock"])
@@ -58,10 +59,71 @@ def test_the_code_of_the_page_runs() -> None:
     assert names["info"]["status"] == "ongoing"  # type: ignore[index]
 
 
-def test_the_package_declares_gymnasiums_entry_point() -> None:
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-    module, _, name = project["entry-points"]["gymnasium.envs"]["mme_vla"].partition(":")
-    assert callable(getattr(__import__(module, fromlist=[name]), name))
+FRESH = {
+    "an import": "import gymnasium, mme_vla.envs.gym\nname = 'mme_vla/StopCube-v0'",
+    "a module before the name": "import gymnasium\nname = 'mme_vla.envs.gym:mme_vla/StopCube-v0'",
+}
+"""How the page says that a task is made."""
+VECTORS = {
+    "sync": "envs = gymnasium.make_vec(name, num_envs=2, vectorization_mode='sync', images=False, episode=0)",
+    "async": "envs = gymnasium.make_vec(name, num_envs=2, vectorization_mode='async', images=True, episode=0)",
+}
+
+
+def run_fresh(code: str, seconds: int = 300) -> str:
+    """What a new process prints, which has imported nothing before."""
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    finished = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=seconds)
+    assert finished.returncode == 0, finished.stderr[-2000:]
+    return finished.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beginning", FRESH.values(), ids=FRESH)
+def test_a_fresh_process_makes_a_task(beginning: str) -> None:
+    code = f"{beginning}\nenv = gymnasium.make(name, images=False)\nprint(env.reset(seed=0)[1]['status'])\nenv.close()"
+    assert run_fresh(code).split() == ["ongoing"]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("renderer")
+@pytest.mark.parametrize("made", VECTORS.values(), ids=VECTORS)
+def test_vector_environments_step_in_a_fresh_process(made: str) -> None:
+    code = f"""{FRESH["an import"]}
+if __name__ == "__main__":
+    {made}
+    envs.reset(seed=0)
+    print(envs.step(envs.action_space.sample())[4]["status"].tolist())
+    envs.close()"""
+    assert run_fresh(code).strip() == "['ongoing', 'ongoing']"
+
+
+def test_making_a_task_opens_no_simulator() -> None:
+    env = mme_vla.envs.gym.GymTask("PatternLock")
+    assert env._env is None and env.action_space.shape == (7,)
+
+
+@pytest.mark.parametrize("bad", [[np.nan] * 8, [0.0] * 7, [np.inf] * 8], ids=["NaN", "seven numbers", "infinite"])
+def test_an_episode_that_ends_in_an_error_says_why(bad: list[float]) -> None:
+    env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0)
+    try:
+        env.reset()
+        info = env.step(np.array(bad))[4]
+        assert info["status"] == "error" and len(info["error_message"]) > 10
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("max_steps", [1, 4])
+def test_an_episode_is_truncated_at_the_step_after_its_limit(max_steps: int) -> None:
+    env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0, max_steps=max_steps)
+    try:
+        env.reset()
+        hold = np.append(env._observation["state"][:7], 1.0)
+        truncated = [env.step(hold)[3] for _ in range(max_steps + 1)]
+        assert truncated == [False] * max_steps + [True]
+    finally:
+        env.close()
 
 
 @pytest.mark.slow

@@ -156,7 +156,9 @@ class SubtaskPolicy(MMEPolicy):
         blocks = self.backbone.embed(self.prepare_images(batch))
         return torch.cat([block.tokens for block in blocks], 1), torch.cat([block.mask for block in blocks], 1)
 
-    def forward(self, batch: Batch, *args: Any, **options: Any) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(  # type: ignore[override]  # returns metrics too, as all policies do
+        self, batch: Batch, *args: Any, **options: Any
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """The action's loss under the recorded words, and the weighted cross entropy of these.
 
         Each word's counts as much as its sample (`Batch.weight`).
