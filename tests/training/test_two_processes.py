@@ -1,0 +1,85 @@
+"""Several processes of a launcher train one policy, or are refused; a model that is wrapped exchanges its gradients."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch.func import functional_call
+
+from helpers import commands
+from mme_vla.cli import COMMANDS, SHARED, check_launcher
+from mme_vla.cli.train import check_processes
+from mme_vla.errors import UserError
+from mme_vla.model import MMEModel
+from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
+
+TORCHRUN = ("torch.distributed.run", "--nproc-per-node", "2", "--master-port")
+TINY = ("backbone=tiny", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1")
+
+
+def small_model() -> tuple[MMEModel, tuple]:
+    policy = small_policy("framesamp_modul", backbone={"vision": SMALL_VISION})
+    model = MMEModel(policy.backbone, policy.memory, policy.integration)
+    return model, (random_batch(policy), model.training_noise(2, torch.Generator().manual_seed(0)))
+
+
+def test_calling_a_model_gives_its_loss_also_functionally_and_on_the_meta_of_a_wrapper() -> None:
+    model, arguments = small_model()
+    loss = model.loss(*arguments)
+    assert torch.equal(model(*arguments), loss)
+    assert torch.equal(functional_call(model, dict(model.named_parameters()), arguments), loss)
+    assert torch.equal(torch.nn.DataParallel(model, device_ids=[])(*arguments), loss)
+
+
+def test_hooks_of_a_model_run_when_it_is_called() -> None:
+    model, arguments = small_model()
+    seen: list[torch.Tensor] = []
+    model.register_forward_hook(lambda module, inputs, output: seen.append(output))
+    model(*arguments)
+    assert len(seen) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "port"), [("ddp", "29613"), ("fsdp", "29614")])
+def test_two_processes_exchange_the_gradients_of_a_model_that_is_called(kind: str, port: str, tmp_path: Path) -> None:
+    script = str(Path(commands.__file__).with_name("ddp_gradients.py"))
+    done = commands.run(*TORCHRUN, port, script, kind, str(tmp_path), env={"OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr[-3000:]
+    first, second = (torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in (0, 1))
+    assert first.abs().max() > 0 and torch.equal(first, second)
+
+
+@pytest.mark.slow
+def test_two_processes_without_a_gpu_train_one_policy(tmp_path: Path) -> None:
+    words = ("model=pi05", *TINY, "train.steps=2", "train.batch_size=2", f"output={tmp_path / 'run'}")
+    done = commands.run(*TORCHRUN, "29615", "-m", "mme_vla.train", *words, env={"CUDA_VISIBLE_DEVICES": ""})
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "2 × " in done.stdout
+    runs = sorted(path.parent for path in tmp_path.rglob("summary.json"))
+    assert runs == [tmp_path / "run"]
+    assert json.loads((runs[0] / "summary.json").read_text())
+
+
+def test_processes_that_would_train_apart_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    check_processes(2)
+    with pytest.raises(UserError, match="WORLD_SIZE=2, but 1 of these processes"):
+        check_processes(1)
+    monkeypatch.delenv("WORLD_SIZE")
+    check_processes(1)
+
+
+@pytest.mark.parametrize("module", sorted({module for module, _ in COMMANDS.values()} - SHARED))
+def test_commands_that_share_no_work_are_refused_under_a_launcher(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(UserError, match="does not share its work"):
+        check_launcher(module)
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    check_launcher(module)
+
+
+@pytest.mark.parametrize("module", sorted(SHARED))
+def test_commands_that_share_their_work_start_under_a_launcher(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "8")
+    check_launcher(module)
