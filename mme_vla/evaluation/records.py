@@ -67,6 +67,8 @@ class EpisodeRecord:
     model: name of the model (`framesamp_modul`). checkpoint: its step, or a name.
     model_seed: of the policy's noise; it does not reach the environment.
     task, episode: which episode of the split; seed, difficulty: the environment's, from the benchmark's metadata.
+    scene: digest of the scene's values and places (`mme_vla/envs/scene_digest.py`); `no values` of an environment that
+        gives none, `not built` where the episode ended before; None in records from before there were digests.
     outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error` (see `error`).
     steps: control steps executed, one an action but for planned motions. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
@@ -101,6 +103,7 @@ class EpisodeRecord:
     event: str | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     extra: dict[str, Any] = field(default_factory=dict)
+    scene: str | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
