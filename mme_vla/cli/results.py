@@ -14,7 +14,7 @@ from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
-from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all, pair_methods, why_unpaired
 from mme_vla.evaluation.results.curves import process_tables, stress_curves, stress_figures, stress_table
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
@@ -34,7 +34,7 @@ from mme_vla.evaluation.results.tables import (
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import find_records, read_folders
-from mme_vla.utils.pages import render
+from mme_vla.utils.pages import escape_markdown, render
 
 DEMO = (
     ("pi05", None),
@@ -98,6 +98,7 @@ def run(args: argparse.Namespace) -> None:
     if any(record.extra.get("made_up") for record in records):
         results.notes.insert(0, "Made-up records, sampled from the paper's rates: not a result of anything.")
     comparisons = compare_all(_pairs(results, args.compare), protocol)
+    results.notes += [note for comparison in comparisons for note in comparison.notes]
     # Piped into a file there is no terminal to fit: as wide as the tables are.
     console = Console(width=None if sys.stdout.isatty() else 200)
     for table in _tables(results, comparisons, detailed=not args.brief):
@@ -137,7 +138,7 @@ def show_events(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> N
     curves = event_curves(records, args.confidence, args.conflicts)
     tables = [event_table(records, args.conflicts), stress_table(curves, "Success over the length of events")]
     figures = stress_figures(curves, "control steps, frames or factor")
-    show_tables([table for table in tables if table.rows], figures, "Episodes that every length has.", args)
+    show_tables(tables, figures, "Episodes that every length has.", args)
 
 
 def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
@@ -154,17 +155,22 @@ def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None
 
 
 def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace) -> None:
-    """Print tables, and write them, with figures, where a file is named."""
+    """Print tables that have rows, and all notes, and write them, with figures, where a file is named."""
     from mme_vla.evaluation.results.report import Section, html_page
 
     texts: dict[Path, str] = {}
+    notes = [note for table in tables for note in table.notes]
+    tables = [table for table in tables if table.rows]
     for table in tables:
         print_table(table, 200)
+    print("".join(f"• {printable(note)}\n" for note in notes), end="")
     if args.markdown:
-        texts[args.markdown] = "\n".join(map(to_markdown, tables))
+        lines = [f"- {escape_markdown(note)}\n" for note in notes]
+        texts[args.markdown] = "\n".join([*map(to_markdown, tables), "".join(lines)])
     if args.html:
         boxes = [Section(name, figure, caption=caption) for name, figure in figures.items()]
-        texts[args.html] = html_page(args.title, [*boxes, *(Section(table.title, tables=[table]) for table in tables)])
+        sections = [*boxes, *(Section(table.title, tables=[table]) for table in tables)]
+        texts[args.html] = html_page(args.title, sections, notes=notes)
     _write(texts)
 
 
@@ -212,13 +218,15 @@ def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[
     if requested is not None:
         return [(results.method(first), results.method(second)) for first, second in requested]
     if pairs := matched_methods(results):
+        results.notes += [why_unpaired(*pair) for pair in pairs if not common_episodes(*pair)]
         return [pair for pair in pairs if common_episodes(*pair)]
     if len(results.methods) != 2:
         return []
     first, second = results.methods
     if common_episodes(first, second):
         return [(first, second)]
-    results.notes.append(f"{first.label} and {second.label} have no episode in common, and are not compared.")
+    reasons = pair_methods(first, second).notes(f"{first.label} and {second.label}")
+    results.notes += reasons or [f"{first.label} and {second.label} have no episode in common, and are not compared."]
     return []
 
 

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
+from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import parse_json, to_line, verified
@@ -119,6 +120,11 @@ class EpisodeRecord:
                       self.composition, self.training, self.event)  # fmt: skip
 
     @property
+    def named_scene(self) -> str | None:
+        """The digest of the scene; None where there is none."""
+        return None if self.scene in (NO_VALUES, NOT_BUILT) else self.scene
+
+    @property
     def key(self) -> EpisodeKey:
         return EpisodeKey(self.task, self.episode)
 
@@ -144,7 +150,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     """One record for each episode of each run, in the order they first came.
 
     Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays. Different outcomes
-    of one episode are refused: the same checkpoint and seed were evaluated twice.
+    of one episode are refused: the same checkpoint and seed were evaluated twice. So are different scenes.
 
     records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
@@ -161,7 +167,15 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
             "these are not the same benchmark; evaluate both from the same episode metadata.",
         )
-        if new.outcome in (old.outcome, "error"):
+        if new.outcome == "error":
+            continue
+        scenes = {new.named_scene, old.named_scene} - {None}
+        require(
+            conflicts != "refuse" or len(scenes) < 2,
+            f"{new.task} {new.episode} ({new.run}) was run in different scenes: {old.scene} at {old.when}, {new.scene} "
+            f"at {new.when}. Name one of the runs, or choose conflicts first or last.",
+        )
+        if new.outcome == old.outcome and len(scenes) < 2:
             continue
         require(
             conflicts != "refuse",
