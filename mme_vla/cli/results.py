@@ -49,6 +49,9 @@ EXAMPLES = ("outputs/evaluation --html report.html", "runs/a runs/b --compare fr
 VERIFY_EXAMPLES = ("outputs/evaluation/framesamp_modul/80000/seed42", "receipt.json --checkpoint downloads/step_080000")
 
 
+DIFFERS, NOT_COMPARED = 1, 3  # exit codes of `verify`; 2 is a mistake in the command
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write; or check receipts."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -59,17 +62,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def verify(args: argparse.Namespace) -> None:
-    """Check receipts, print what differs, and end with code 1 if anything does."""
+    """Check receipts, print what differs and what was not compared.
+
+    Ends with code 1 if anything differs, else with 3 if anything was not compared.
+    """
     from mme_vla.evaluation import receipts
 
     paths = [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
     require(paths, f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or below.")
-    results = {path: receipts.verify(path, args.checkpoint) for path in paths}
-    for path, (differences, notes) in results.items():
-        print(f"{path}: {'differs' if differences else 'agrees'}")
-        print("".join(f"  {printable(line)}\n" for line in [*differences, *(f"note: {n}" for n in notes)]), end="")
-    if any(differences for differences, _ in results.values()):
-        raise SystemExit(1)
+    results = {path: receipts.verify(path, args.checkpoint, not args.no_scenes) for path in paths}
+    for path, result in results.items():
+        print(f"{path}: {result.word}")
+        lines = [*result.differences, *(f"not compared: {line}" for line in result.not_compared)]
+        lines += [f"note: {line}" for line in result.notes]
+        print("".join(f"  {printable(line)}\n" for line in lines), end="")
+    words = {result.word for result in results.values()}
+    if "differs" in words:
+        raise SystemExit(DIFFERS)
+    if "not compared" in words:
+        raise SystemExit(NOT_COMPARED)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -234,6 +245,8 @@ def _verify_parser() -> argparse.ArgumentParser:
     parser = argument_parser("mme-vla results verify", "Check receipts of runs, without a network.", VERIFY_EXAMPLES)
     parser.add_argument("receipt", type=Path, help="receipt.json, or a folder with receipts in it or below")
     parser.add_argument("--checkpoint", type=Path, help="its folder on this machine, if another than in the receipt")
+    parser.add_argument("--no-scenes", action="store_true",
+                        help="do not build the scenes here (0.1 s each); they count as not compared")  # fmt: skip
     return parser
 
 
