@@ -14,7 +14,7 @@ from mme_vla.envs.metadata import FURTHER_SPLITS, HARD, HARD_EPISODES
 from mme_vla.errors import UserError, printable, require
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
-from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all, pair_methods, why_unpaired
 from mme_vla.evaluation.results.curves import process_tables, stress_curves, stress_figures, stress_table
 from mme_vla.evaluation.results.events import event_curves, event_table, matched_methods
 from mme_vla.evaluation.results.paper import demo_records
@@ -34,7 +34,7 @@ from mme_vla.evaluation.results.tables import (
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import find_records, read_folders
-from mme_vla.utils.pages import render
+from mme_vla.utils.pages import escape_markdown, render
 
 DEMO = (
     ("pi05", None),
@@ -49,6 +49,9 @@ EXAMPLES = ("outputs/evaluation --html report.html", "runs/a runs/b --compare fr
 VERIFY_EXAMPLES = ("outputs/evaluation/framesamp_modul/80000/seed42", "receipt.json --checkpoint downloads/step_080000")
 
 
+DIFFERS, NOT_COMPARED = 1, 3  # exit codes of `verify`; 2 is a mistake in the command
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write; or check receipts."""
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -59,17 +62,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def verify(args: argparse.Namespace) -> None:
-    """Check receipts, print what differs, and end with code 1 if anything does."""
+    """Check receipts, print what differs and what was not compared.
+
+    Ends with code 1 if anything differs, else with 3 if anything was not compared.
+    """
     from mme_vla.evaluation import receipts
 
     paths = [args.receipt] if args.receipt.is_file() else sorted(args.receipt.rglob("receipt*.json"))
     require(paths, f"{args.receipt} holds no receipt: name a receipt.json, or a folder with one in it or below.")
-    results = {path: receipts.verify(path, args.checkpoint) for path in paths}
-    for path, (differences, notes) in results.items():
-        print(f"{path}: {'differs' if differences else 'agrees'}")
-        print("".join(f"  {printable(line)}\n" for line in [*differences, *(f"note: {n}" for n in notes)]), end="")
-    if any(differences for differences, _ in results.values()):
-        raise SystemExit(1)
+    results = {path: receipts.verify(path, args.checkpoint, not args.no_scenes) for path in paths}
+    for path, result in results.items():
+        print(f"{path}: {result.word}")
+        lines = [*result.differences, *(f"not compared: {line}" for line in result.not_compared)]
+        lines += [f"note: {line}" for line in result.notes]
+        print("".join(f"  {printable(line)}\n" for line in lines), end="")
+    words = {result.word for result in results.values()}
+    if "differs" in words:
+        raise SystemExit(DIFFERS)
+    if "not compared" in words:
+        raise SystemExit(NOT_COMPARED)
 
 
 def run(args: argparse.Namespace) -> None:
@@ -98,6 +109,7 @@ def run(args: argparse.Namespace) -> None:
     if any(record.extra.get("made_up") for record in records):
         results.notes.insert(0, "Made-up records, sampled from the paper's rates: not a result of anything.")
     comparisons = compare_all(_pairs(results, args.compare), protocol)
+    results.notes += [note for comparison in comparisons for note in comparison.notes]
     # Piped into a file there is no terminal to fit: as wide as the tables are.
     console = Console(width=None if sys.stdout.isatty() else 200)
     for table in _tables(results, comparisons, detailed=not args.brief):
@@ -137,7 +149,7 @@ def show_events(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> N
     curves = event_curves(records, args.confidence, args.conflicts)
     tables = [event_table(records, args.conflicts), stress_table(curves, "Success over the length of events")]
     figures = stress_figures(curves, "control steps, frames or factor")
-    show_tables([table for table in tables if table.rows], figures, "Episodes that every length has.", args)
+    show_tables(tables, figures, "Episodes that every length has.", args)
 
 
 def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None:
@@ -154,17 +166,22 @@ def show_ood(records: Sequence[EpisodeRecord], args: argparse.Namespace) -> None
 
 
 def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, args: argparse.Namespace) -> None:
-    """Print tables, and write them, with figures, where a file is named."""
+    """Print tables that have rows, and all notes, and write them, with figures, where a file is named."""
     from mme_vla.evaluation.results.report import Section, html_page
 
     texts: dict[Path, str] = {}
+    notes = [note for table in tables for note in table.notes]
+    tables = [table for table in tables if table.rows]
     for table in tables:
         print_table(table, 200)
+    print("".join(f"• {printable(note)}\n" for note in notes), end="")
     if args.markdown:
-        texts[args.markdown] = "\n".join(map(to_markdown, tables))
+        lines = [f"- {escape_markdown(note)}\n" for note in notes]
+        texts[args.markdown] = "\n".join([*map(to_markdown, tables), "".join(lines)])
     if args.html:
         boxes = [Section(name, figure, caption=caption) for name, figure in figures.items()]
-        texts[args.html] = html_page(args.title, [*boxes, *(Section(table.title, tables=[table]) for table in tables)])
+        sections = [*boxes, *(Section(table.title, tables=[table]) for table in tables)]
+        texts[args.html] = html_page(args.title, sections, notes=notes)
     _write(texts)
 
 
@@ -212,13 +229,15 @@ def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[
     if requested is not None:
         return [(results.method(first), results.method(second)) for first, second in requested]
     if pairs := matched_methods(results):
+        results.notes += [why_unpaired(*pair) for pair in pairs if not common_episodes(*pair)]
         return [pair for pair in pairs if common_episodes(*pair)]
     if len(results.methods) != 2:
         return []
     first, second = results.methods
     if common_episodes(first, second):
         return [(first, second)]
-    results.notes.append(f"{first.label} and {second.label} have no episode in common, and are not compared.")
+    reasons = pair_methods(first, second).notes(f"{first.label} and {second.label}")
+    results.notes += reasons or [f"{first.label} and {second.label} have no episode in common, and are not compared."]
     return []
 
 
@@ -226,6 +245,8 @@ def _verify_parser() -> argparse.ArgumentParser:
     parser = argument_parser("mme-vla results verify", "Check receipts of runs, without a network.", VERIFY_EXAMPLES)
     parser.add_argument("receipt", type=Path, help="receipt.json, or a folder with receipts in it or below")
     parser.add_argument("--checkpoint", type=Path, help="its folder on this machine, if another than in the receipt")
+    parser.add_argument("--no-scenes", action="store_true",
+                        help="do not build the scenes here (0.1 s each); they count as not compared")  # fmt: skip
     return parser
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import check_known, require
 from mme_vla.registry import ENVS
 
@@ -77,6 +78,13 @@ class Environment(ABC):
         """What can be chosen in `play` now: text → the actions that carry it out. Empty: nothing."""
         return {}
 
+    def scene_values(self, env: Any) -> Mapping[str, Any] | None:
+        """What makes the scene of `env`, right after its reset: plain values, the same on every machine.
+
+        Records name a scene by their digest, and results compare equal scenes alone. By default there are none to give.
+        """
+        return None
+
     def episodes(self, task: str, split: str) -> list[EpisodeSpec]:
         """The episodes of a task in a split, in order; by default consecutive seeds, other ones in every split."""
         self.check_task(task)
@@ -126,6 +134,18 @@ class Environment(ABC):
         require(exists, f"Unknown episode {number!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
         return known[number]
 
+    def scene_digest(self, spec: EpisodeSpec) -> str:
+        """Digest of the scene that an episode has on this machine: builds it. `NO_VALUES` without `scene_values`."""
+        if type(self).scene_values is Environment.scene_values:
+            return NO_VALUES
+        env = self.open(spec.task, spec.split, spec.episode, render=False)
+        try:
+            env.reset()
+            digest: str = env.scene_digest
+        finally:
+            env.close()
+        return digest
+
     def step_limit(self, split: str) -> int:
         """Steps after which an episode of a split is a timeout."""
         return 1300
@@ -163,6 +183,9 @@ class EpisodeEnv:
         environment: whose choices are offered. env: its gymnasium environment. spec: which episode.
         max_steps: steps until the status becomes `timeout`.
         by_choice: actions are `{"choice": letter}` among `environment.choices`, and all frames of one are returned.
+
+    Attributes:
+        scene_digest: of the values of the scene, from the reset on.
     """
 
     def __init__(
@@ -172,12 +195,15 @@ class EpisodeEnv:
         self.max_steps, self._by_choice = max_steps, by_choice
         self.goal, self._steps, self._limit = "", 0, max_steps
         self._choices: dict[str, Actions] = {}
+        self.scene_digest = NOT_BUILT
 
     def reset(self) -> tuple[dict[str, list[Any]], dict[str, Any]]:
         """The conditioning video, if there is one, and the current frame."""
         observation, info = self.env.reset(seed=self.spec.seed)
         require(isinstance(info.get("goal"), str), f"{self.spec.task}: reset() must return the goal in info['goal'].")
         self.goal, self._steps, self._limit = info["goal"], 0, self.max_steps
+        values = self.environment.scene_values(self.env)
+        self.scene_digest = NO_VALUES if values is None else scene_digest(values)
         return self._lists([*info.get("video", ()), observation]), self._info(info, False, False)
 
     def step(self, action: Any) -> tuple[dict[str, list[Any]], float, bool, bool, dict[str, Any]]:

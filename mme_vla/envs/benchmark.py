@@ -1,5 +1,6 @@
 """RoboMME as entries of the registry of environments: `mme_vla`, and `official` for the package `robomme`."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from mme_vla.embodiment import Embodiment
@@ -7,6 +8,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
+from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import require
 from mme_vla.registry import ENVS
 
@@ -47,6 +49,28 @@ class RoboMME(Environment):
     def check_hold(self) -> None:
         """Every episode takes a `Hold`."""
 
+    def scene_values(self, env: Any) -> Mapping[str, Any] | None:
+        """What was sampled, and where everything stands; only right after the reset of its task."""
+        values: Mapping[str, Any] = env.task.placed_values()
+        return values
+
+    def scene_digest(self, spec: EpisodeSpec) -> str:
+        """Without the conditioning video, which does not belong to the scene."""
+        from mme_vla.envs.scene.placement import SceneError
+
+        self.check_installed()
+        try:
+            task = make.make_task(spec.task, render=False, **spec.options)
+        except SceneError:
+            return NOT_BUILT
+        try:
+            task.reset()
+            return scene_digest(task.placed_values())
+        except SceneError:
+            return NOT_BUILT
+        finally:
+            task.close()
+
     def open(self, task: str, split: str, episode: int, **options: Any) -> Any:
         return make.make_env(task, split, episode, env=self.name, **options)
 
@@ -59,6 +83,14 @@ class Official(RoboMME):
 
     def check_installed(self) -> None:
         """Nothing of this library's simulator; the package is checked when an episode is made."""
+
+    def scene_values(self, env: Any) -> Mapping[str, Any] | None:
+        """The package tells none."""
+        return None
+
+    def scene_digest(self, spec: EpisodeSpec) -> str:
+        """The package tells no values."""
+        return NO_VALUES
 
     def check_hold(self) -> None:
         """The package has no action for it in every action space."""

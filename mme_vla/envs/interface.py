@@ -28,6 +28,7 @@ from mme_vla.envs.observations import (
 )
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene_digest import NOT_BUILT, scene_digest
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError, check_known, require
@@ -127,6 +128,7 @@ class RoboMMEEnv(gymnasium.Env):
     Attributes:
         on_frame: called with every frame that is returned, for recording.
         render_request: which frames have images, from the next call on; None for all. The others' are None.
+        scene_digest: of the values and places of the scene, from the reset on (`mme_vla.envs.scene_digest`).
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -161,6 +163,7 @@ class RoboMMEEnv(gymnasium.Env):
         task.on_frame = self._on_frame
         self._episodes = 0
         self._run: _Run | None = None
+        self.scene_digest = NOT_BUILT
 
     # Episodes -----------------------------------------------------------------------------------------------------
 
@@ -187,6 +190,7 @@ class RoboMMEEnv(gymnasium.Env):
         task.reset(options={"reconfigure": self._episodes > 0})
         self._muted = False
         self._episodes += 1
+        self.scene_digest = scene_digest(task.placed_values())
         control = Control(task, self._step_control, Demonstrator(task, self._step_control))
         run = self._run = _Run(control, task.progress.displayed, task.reset_action, options=options)
         self._grounding.clear()

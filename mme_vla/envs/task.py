@@ -187,6 +187,14 @@ class Task(Stage):
         scene = {"task": type(self).__name__, "seed": self.seed, "difficulty": self.difficulty}
         return scene | facts | {"spec": self.values.copy().spec}
 
+    def placed_values(self) -> dict[str, Any]:
+        """What was sampled, and position and quaternion [7] of every object; right after the reset, before any step.
+
+        The discs of `in_view` do not count: the twin of a scene is the same scene.
+        """
+        poses = {thing.name: [*thing.pose.p.tolist(), *thing.pose.q.tolist()] for thing in self.things}
+        return {"spec": self.values.copy().spec, "poses": poses}
+
     def draw_failed_pick(self, draws: Draws, picks: int) -> int:
         """Which of the execution's `picks` a recovery demonstration fails first."""
         return draws.integer(0, picks)

@@ -1,19 +1,20 @@
 """Receipts: what a third person needs to check a score, in one JSON beside each file of records."""
 
 import hashlib
-import lzma
 import platform
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mme_vla.config.naming import digest, flat
-from mme_vla.envs.base import environment
-from mme_vla.errors import UserError, brief, require
+from mme_vla.envs.base import Environment, environment
+from mme_vla.envs.make import ROBOMME
+from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT
+from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
 from mme_vla.evaluation.store import RUN_FILE, read_records, read_run
 from mme_vla.policy.base import Policy
@@ -21,16 +22,68 @@ from mme_vla.policy.run_folders import STATE
 from mme_vla.policy.training_identity import identity_of
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
-from mme_vla.utils import Sums, file_sum, read_json, to_json, verified, with_checksum, write_json
+from mme_vla.utils import (
+    SUMS,
+    Sums,
+    file_sum,
+    inside,
+    read_json,
+    read_unpacked,
+    to_json,
+    verified,
+    with_checksum,
+    write_json,
+)
 
-_SIMULATOR, _LIBRARIES = ("mani_skill", "sapien", "robomme"), ("torch", "numpy")
+CODE = (
+    "backbone", "embodiment", "envs", "evaluation/rollout", "integration", "memory", "methods", "policy", "processing",
+    "speed", "subgoal",
+)  # fmt: skip
+"""Packages of this library that can change a result: policies, scenes, rollouts. Their source is digested."""
+SIMULATOR = ("mani_skill", "sapien", "robomme", "gymnasium", "trimesh", "scipy", "ompl", "pin", "toppra")
+"""Packages that decide scenes and motions."""
+LIBRARIES = ("torch", "numpy", "pillow", "safetensors", "sentencepiece", "timm", "transformers")
+"""Packages that decide what a policy computes."""
+MOTIONS = ("waypoint", "multi_choice")
+"""Action spaces of RoboMME whose actions are motions of many steps: the last one may go beyond the step limit."""
+_MARGIN = 2  # steps beyond its limit that the benchmark counts
+_CONFIG = "config.json"  # every checkpoint's
 _OF_TRAINING = ("raw.", "raw-", "optimizer", STATE)  # Files of a checkpoint that no policy is loaded from
+_LOADED = (".safetensors", ".json", ".model", ".pt", ".pth", ".bin")  # and endings of those that one may be
+_IDENTITY = {
+    "model": "model", "checkpoint": "checkpoint", "seed": "model_seed", "split": "split", "max_steps": "max_steps",
+}  # fmt: skip
+"""Setting of `run.json` → field of its records."""
 _FEW = 5  # differences of one kind that are listed
 
 
+class Verification(NamedTuple):
+    """What came of checking a receipt, a line each.
+
+    differences: what is another here than in the receipt. not_compared: what there was nothing to compare with, which
+    is no agreement. notes: what may be another without any weight, such as the type of CPU.
+    """
+
+    differences: list[str]
+    not_compared: list[str]
+    notes: list[str]
+
+    @property
+    def word(self) -> str:
+        """`differs`, `not compared` where nothing differs and something was not compared, or `agrees`."""
+        if self.differences:
+            return "differs"
+        return "not compared" if self.not_compared else "agrees"
+
+    def once(self) -> "Verification":
+        """Without the lines that stand twice."""
+        return Verification(*(list(dict.fromkeys(lines)) for lines in self))
+
+
 def receipt_file(records: Path) -> Path:
-    """The receipt of `episodes.jsonl` is `receipt.json`, that of `episodes-0of4.jsonl` `receipt-0of4.json`."""
-    return records.with_name(records.name.replace("episodes", "receipt")).with_suffix(".json")
+    """The receipt of `episodes.jsonl` is `receipt.json`, that of `episodes-0of4.jsonl.xz` `receipt-0of4.json`."""
+    name = records.name.removesuffix(".xz").replace("episodes", "receipt")
+    return records.with_name(name).with_suffix(".json")
 
 
 @contextmanager
@@ -63,136 +116,363 @@ def receipt(records: Path, policy: Policy, run: Mapping[str, Any], source: str |
 
 
 def read_receipt(path: Path) -> dict[str, Any]:
-    """Read a receipt."""
+    """Read a receipt.
+
+    Raises:
+        UserError: it is damaged, lacks a part, or a part is of another kind.
+    """
     content: dict[str, Any] = verified(read_json(path, "a receipt"), str(path))
     missing = [key for key in ("settings", "conditions", "records", "scenes", "score") if key not in content]
     require(not missing, f"{path} is no receipt of an evaluation: it has no {', '.join(missing)}.")
+    for key in ("settings", "records", "score"):
+        kind = isinstance(content[key], Mapping)
+        require(kind, f"{path} is no receipt of an evaluation: {key} must hold an object, not {brief(content[key])}.")
+    parts = content["conditions"]
+    kinds = isinstance(parts, list) and all(isinstance(part, Mapping) for part in parts)
+    require(kinds, f"{path} is no receipt of an evaluation: conditions must list objects, not {brief(parts)}.")
     return content
 
 
-def verify(path: Path, checkpoint: Path | None = None) -> tuple[list[str], list[str]]:
+def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Verification:
     """Check a receipt offline: recompute the digests of the files that are here, compare versions of what is installed.
 
     Args:
         path: of the receipt; its records, or these as `.xz`, and `run.json` are beside it.
         checkpoint: where the checkpoint is, if not at the place that the receipt names.
+        build: whether the scenes are built here, without images, and compared: about 0.1 s a scene.
 
-    Returns:
-        What differs, and what could not be compared or is another machine's.
+    Raises:
+        UserError: the file is no receipt, or a name in it leads outside of the folder that it is of.
     """
-    content, folder = read_receipt(path), path.parent
-    settings, differences, notes = content["settings"], list[str](), list[str]()
-    if (folder / RUN_FILE).is_file():
-        differences += _differences("settings", settings, read_run(folder)["settings"])
-    else:
-        notes.append(f"{RUN_FILE} is not beside the receipt: the settings are the receipt's word alone.")
-    records = folder / content["records"]["file"]
-    records = records if records.is_file() else records.with_name(f"{records.name}.xz")
-    if records.is_file():
-        score = to_json(_score(records, settings))
-        for key in ("records", "score", "scenes"):
-            differences += _differences(key, content[key], score[key])
-        if why := _unknown_scenes(read_records(records), settings):
-            notes.append(f"scenes: not compared. {why}")
-        else:
-            differences += _other_scenes(read_records(records), settings)
-    else:
-        differences.append(f"records: {content['records']['file']} is not beside the receipt, nor {records.name}.")
+    content = read_receipt(path)
+    found = Verification([], [], [])
+    _compare_settings(found, content["settings"], path.parent)
+    _compare_records(found, content, path.parent, build)
+    if not content["conditions"]:
+        parts = ("code", "simulator", "renderer", "libraries", "checkpoint", "statistics")
+        found.not_compared.extend(f"{part}: the receipt names no conditions, and has one at least." for part in parts)
     for part in content["conditions"]:
-        here = _conditions(part["hardware"]["gpu"] is not None, part["renderer"] is not None)
-        for key in ("code", "simulator", "renderer", "libraries"):
-            differences += _differences(key, part[key], here[key])
-        notes += _differences("hardware", part["hardware"], here["hardware"])
-        place = checkpoint or Path(part["checkpoint"]["folder"] or "")
-        if not part["checkpoint"]["files"]:
-            notes.append("checkpoint: no file of it was on the machine of the run, so none is compared.")
-        elif not place.is_dir():
-            notes.append(f"checkpoint: {place} is not here. Name its folder with --checkpoint.")
+        _compare_conditions(found, part)
+        _compare_checkpoint(found, part, checkpoint)
+    return found.once()
+
+
+# The records and their settings -----------------------------------------------------------------------------------
+
+
+def _compare_settings(found: Verification, settings: Mapping[str, Any], folder: Path) -> None:
+    if (folder / RUN_FILE).is_file():
+        found.differences.extend(_differences("settings", settings, read_run(folder)["settings"]))
+    else:
+        found.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
+
+
+def _compare_records(found: Verification, content: Mapping[str, Any], folder: Path, build: bool) -> None:
+    """Digests and score of the records, each record with the settings, and their scenes."""
+    settings, name = content["settings"], content["records"].get("file")
+    if not isinstance(name, str):
+        found.not_compared.append("records: the receipt names no file of them.")
+        return
+    records = inside(folder, name, "records")
+    packed = inside(folder, f"{name}.xz", "records")
+    records = records if records.is_file() else packed
+    if not records.is_file():
+        found.differences.append(f"records: {name} is not beside the receipt, nor {packed.name}.")
+        return
+    here, lines = to_json(_score(records, settings)), read_records(records)
+    for key in ("records", "score", "scenes", "scene_digests"):
+        if key in content or here[key]:
+            found.differences.extend(_differences(key, content.get(key), here[key]))
+    if not lines:
+        found.not_compared.append("records: the file has no episode.")
+    _compare_identity(found, lines, content)
+    if not isinstance(settings.get("env"), str):
+        found.not_compared.append("scenes: the settings name no environment.")
+        return
+    try:
+        env = environment(settings["env"])
+        for task in {record.task for record in lines}:
+            env.check_task(task)
+        _compare_seeds(found, lines, env)
+    except UserError as error:  # an environment or a task of a plugin that is not loaded
+        found.not_compared.append(f"scenes: {error}")
+        return
+    _compare_scenes(found, lines, env, build)
+
+
+def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]) -> None:
+    """Whether every record is of the settings: model, checkpoint, seed, split, step limit, event, training."""
+    settings = content["settings"]
+    expected: dict[str, Any] = {}
+    for key, field in _IDENTITY.items():
+        if key in settings:
+            expected[field] = settings[key]
         else:
-            files = part["checkpoint"]["files"]
-            differences += _differences("checkpoint", files, _sums(place, files))
-            if (place / STATS_FILE).is_file():
-                statistics = digest(NormStats.load(place / STATS_FILE).to_dict(), 64)
-                differences += _differences("statistics", part["statistics"], statistics)
-    return list(dict.fromkeys(differences)), list(dict.fromkeys(notes))
+            found.not_compared.append(f"settings.{key}: the receipt does not name it, so no record is compared with it.")
+    subgoal = settings.get("subgoal")
+    expected["subgoal"] = subgoal.get("name") if isinstance(subgoal, Mapping) else subgoal
+    expected["event"] = settings.get("event")
+    for field, value in expected.items():
+        others = [record for record in records if str(getattr(record, field)) != str(value)]
+        _add_records(found, others, field, lambda record, field=field: getattr(record, field), value, "settings")
+    if "training" in content:
+        others = [r for r in records if (None if r.training is None else asdict(r.training)) != content["training"]]
+        _add_records(found, others, "training", lambda record: record.training, content["training"], "receipt")
+    named = [record for record in records if "env" in record.extra and "env" in settings]
+    others = [record for record in named if record.extra["env"] != settings["env"]]
+    _add_records(found, others, "env", lambda record: record.extra["env"], settings.get("env"), "settings")
+    for field in ("composition", "action_space"):
+        values = sorted({str(getattr(record, field)) for record in records})
+        if len(values) > 1:
+            found.differences.append(f"records.{field}: several in one run, {', '.join(map(brief, values[:_FEW]))}")
+    _compare_steps(found, records, settings)
+
+
+def _compare_steps(found: Verification, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]) -> None:
+    """Whether no episode is longer than its limit, by which the time that events hold the robot counts as well."""
+    from mme_vla.evaluation.rollout.events import read_events
+
+    limit = settings.get("max_steps")
+    if not isinstance(limit, int):
+        found.not_compared.append("steps: the settings name no step limit.")
+        return
+    try:
+        limit += _MARGIN + sum(placed.event.hold for placed in read_events(settings.get("event")))
+    except UserError as error:
+        found.not_compared.append(f"steps: {error}")
+        return
+    motions = settings.get("env") in ROBOMME and any(record.action_space in MOTIONS for record in records)
+    long = [record for record in records if record.steps < 0 or (record.steps > limit and not motions)]
+    _add_records(found, long, "steps", lambda record: record.steps, f"0 to {limit}", "settings")
+    if motions and any(record.steps > limit for record in records):
+        found.notes.append("steps: some episodes end beyond their limit, with a last action that is a motion of many.")
+
+
+def _add_records(
+    found: Verification,
+    others: Sequence[EpisodeRecord],
+    field: str,
+    value_of: Callable[[EpisodeRecord], Any],
+    expected: Any,
+    where: str,
+) -> None:
+    """One line on all records that have another value in a field than is expected."""
+    if others:
+        first = others[0]
+        more = f", and {len(others) - 1} more" if len(others) > 1 else ""
+        found.differences.append(
+            f"records.{field}: {brief(value_of(first))} in the record of {brief(first.task, quote=False)} "
+            f"{first.episode}{more}; {brief(expected)} by the {where}"
+        )
+
+
+def _compare_seeds(found: Verification, records: Iterable[EpisodeRecord], env: Environment) -> None:
+    """Episodes whose seed or difficulty is not the one that the environment gives them here."""
+    for record in records:
+        spec = env.episode(record.task, record.split, record.episode)
+        then, here = f"{record.seed}, {record.difficulty}", f"{spec.seed}, {spec.difficulty}"
+        found.differences.extend(_differences(f"scene {record.task} {record.episode}", then, here))
+
+
+def _compare_scenes(found: Verification, records: Sequence[EpisodeRecord], env: Environment, build: bool) -> None:
+    """Build the scenes that records name, and compare their digests."""
+    unnamed = sum(record.scene is None for record in records)
+    valueless = sum(record.scene == NO_VALUES for record in records)
+    if unnamed:
+        found.not_compared.append(
+            f"scenes: {unnamed} records do not name the scene that was built, as those of earlier versions; seeds and "
+            "difficulties alone are compared."
+        )
+    if valueless:
+        found.not_compared.append(f"scenes: the environment gave no values of {valueless} episodes.")
+    named = {(r.task, r.split, r.episode, r.scene) for r in records if r.scene not in (None, NO_VALUES)}
+    if named and not build:
+        found.not_compared.append(f"scenes: {len(named)} were not built here, as was asked.")
+        return
+    unbuilt = 0
+    for task, split, episode, scene in sorted(named):
+        try:
+            here = env.scene_digest(env.episode(task, split, episode))
+        except UserError as error:
+            found.not_compared.append(f"scenes: they cannot be built here. {error}")
+            return
+        if scene == NOT_BUILT and here != NOT_BUILT:
+            unbuilt += 1
+        elif here == NO_VALUES:
+            found.not_compared.append(f"scenes: the environment gives no values of {task} here.")
+        else:
+            found.differences.extend(_differences(f"scene {task} {episode}", scene, here))
+    if unbuilt:
+        found.not_compared.append(f"scenes: {unbuilt} episodes ended before their scene was built; it can be here.")
 
 
 def _score(records: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Outcomes of each task, and digests of the records, uncompressed, and of their scenes."""
-    lines = read_records(records) if records.exists() else []
-    name, total = records.name.removesuffix(".xz"), None
+    """Outcomes of each task, digests of the records, uncompressed, and of their scenes, and those scenes built."""
+    lines, total = list[EpisodeRecord](), None
     if records.exists():
-        content = records.read_bytes()
-        content = lzma.decompress(content) if records.suffix == ".xz" else content
-        total = hashlib.sha256(content).hexdigest()
+        lines = read_records(records)
+        total = hashlib.sha256(read_unpacked(records, "episode records")).hexdigest()
     tasks = dict.fromkeys(record.task for record in lines)
     return {
-        "records": {"file": name, "sha256": total},
-        "scenes": _scenes(lines, settings["split"]),
+        "records": {"file": records.name.removesuffix(".xz"), "sha256": total},
+        "scenes": _scenes(lines, str(settings.get("split"))),
+        "scene_digests": {f"{record.task} {record.episode}": record.scene for record in lines if record.scene},
         "score": {task: count_outcomes(line for line in lines if line.task == task) for task in tasks},
     }
 
 
 def _scenes(records: Iterable[EpisodeRecord], split: str) -> str:
-    """Digest of what makes the scenes: task, number, seed and difficulty; and the file of a split that is one."""
+    """Digest of what names the scenes: task, number, seed and difficulty; and the file of a split that is one."""
     scenes: dict[str, Any] = {f"{r.task} {r.episode}": [r.seed, r.difficulty] for r in records}
     return digest({"split": file_sum(Path(split)) if Path(split).is_file() else split, "scenes": scenes}, 64)
 
 
-def _unknown_scenes(records: Iterable[EpisodeRecord], settings: Mapping[str, Any]) -> str | None:
-    """Why there are no scenes here to compare with: an environment or a task of a plugin that is not loaded."""
-    try:
-        env = environment(settings["env"])
-        for task in {record.task for record in records}:
-            env.check_task(task)
-    except UserError as error:
-        return str(error)
-    return None
-
-
-def _other_scenes(records: Iterable[EpisodeRecord], settings: Mapping[str, Any]) -> list[str]:
-    """Episodes whose seed or difficulty is not the one that the environment gives them here."""
-    env, lines = environment(settings["env"]), list[str]()
-    for record in records:
-        spec = env.episode(record.task, record.split, record.episode)
-        here = f"{spec.seed}, {spec.difficulty}"
-        lines += _differences(f"scene {record.task} {record.episode}", f"{record.seed}, {record.difficulty}", here)
-    return lines
+# The conditions ---------------------------------------------------------------------------------------------------
 
 
 def _conditions(on_gpu: bool, renders: bool) -> dict[str, Any]:
     """Code, simulator, renderer, libraries and hardware of this process."""
+    return {
+        "code": {"mme-vla": version("mme-vla"), "covers": list(CODE), "sha256": _code(CODE)},
+        "simulator": {name: _version(name) for name in SIMULATOR},
+        "renderer": _renderer() if renders else None,
+        "libraries": {name: _version(name) for name in LIBRARIES},
+        "hardware": _hardware(on_gpu),
+    }
+
+
+def _code(packages: Iterable[str]) -> str:
+    """Digest of the source files of packages of this library."""
+    root = Path(__file__).resolve().parents[1]
+    files = sorted(path for package in packages for path in (root / package).rglob("*.py"))
+    return digest({path.relative_to(root).as_posix(): file_sum(path) for path in files}, 64)
+
+
+def _hardware(on_gpu: bool) -> dict[str, Any]:
     import torch
 
-    package = Path(__file__).resolve().parents[1]
-    code = {path.relative_to(package).as_posix(): file_sum(path) for path in sorted(package.rglob("*.py"))}
-    return {
-        "code": {"mme-vla": version("mme-vla"), "files": digest(code, 64)},
-        "simulator": {name: _version(name) for name in _SIMULATOR},
-        "renderer": _renderer() if renders else None,
-        "libraries": {name: _version(name) for name in _LIBRARIES},
-        "hardware": {
-            "cpu": _cpu(), "gpu": torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None
-        },
-    }  # fmt: skip
+    return {"cpu": _cpu(), "gpu": torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None}
+
+
+def _compare_conditions(found: Verification, part: Mapping[str, Any]) -> None:
+    _compare_code(found, part.get("code"))
+    _compare_versions(found, "simulator", part.get("simulator"), SIMULATOR)
+    _compare_versions(found, "libraries", part.get("libraries"), LIBRARIES)
+    if "renderer" not in part:
+        found.not_compared.append("renderer: the receipt does not say what rendered.")
+    elif part["renderer"] is not None:
+        found.differences.extend(_differences("renderer", part["renderer"], _renderer()))
+    hardware = part.get("hardware")
+    if isinstance(hardware, Mapping):
+        found.notes.extend(_differences("hardware", hardware, _hardware(hardware.get("gpu") is not None)))
+    else:
+        found.not_compared.append("hardware: the receipt names none.")
+
+
+def _compare_code(found: Verification, code: Any) -> None:
+    """The source of the packages that the receipt's digest covers, if these are all that can change a result."""
+    if not isinstance(code, Mapping) or not ({"sha256", "files"} & code.keys()):
+        found.not_compared.append("code: the receipt has no digest of it.")
+        return
+    if "mme-vla" in code:
+        found.differences.extend(_differences("code.mme-vla", code["mme-vla"], version("mme-vla")))
+    else:
+        found.not_compared.append("code.mme-vla: the receipt does not name the version.")
+    if "sha256" not in code:  # of an earlier version, which digested every file
+        if code["files"] != _code([""]):
+            found.not_compared.append(
+                "code: this receipt's digest is of every file of the library, and some file has changed since: whether "
+                "one that can change a result, it cannot tell."
+            )
+        return
+    covers = code.get("covers")
+    covered = [package for package in CODE if isinstance(covers, list) and package in covers]
+    found.not_compared.extend(f"code.{package}: not in the digest." for package in CODE if package not in covered)
+    others = [] if not isinstance(covers, list) else [package for package in covers if package not in covered]
+    if others:
+        found.not_compared.append(f"code: its digest covers packages that are not compared here, {brief(others)}.")
+    elif covered:
+        found.differences.extend(_differences("code.sha256", code["sha256"], _code(covered)))
+
+
+def _compare_versions(found: Verification, what: str, then: Any, known: Sequence[str]) -> None:
+    """Versions of packages that are named on both sides; the others are not compared."""
+    if not isinstance(then, Mapping) or not then:
+        found.not_compared.append(f"{what}: the receipt names no version.")
+        return
+    common = [name for name in known if name in then]
+    here = {name: _version(name) for name in common}
+    found.differences.extend(_differences(what, {name: then[name] for name in common}, here))
+    lacking = [name for name in known if name not in then and _version(name) is not None]
+    others = [name for name in then if name not in known]
+    if lacking:
+        found.not_compared.append(f"{what}: the receipt does not name the version of {listed(lacking)}.")
+    if others:
+        found.not_compared.append(f"{what}: {listed(others)} of the receipt are no packages that are compared.")
+
+
+# The checkpoint ---------------------------------------------------------------------------------------------------
 
 
 def _checkpoint(policy: Policy, source: str | None) -> dict[str, Any]:
     """Digests of the files that the weights are from, and of the statistics in use."""
     folder = None if source is None or not Path(source).is_dir() else Path(source).resolve()
-    files: Mapping[str, str | None] = {}
+    files: dict[str, str | None] = {}
     if folder is not None:
-        # Those of the table were compared with the files when they were loaded.
-        files = Sums(folder).table or _sums(folder, [path.name for path in folder.iterdir() if path.is_file()])
+        # Those of the table were compared with the files when they were loaded; a file beside it may be loaded too.
+        files = dict(Sums(folder).table)
+        names = [path.name for path in folder.iterdir() if path.is_file()] if not files else _loaded(folder)
+        files |= _sums(folder, [name for name in names if name not in files])
     statistics = digest(policy.require_processor().require_stats().to_dict(), 64)
-    selected = {name: value for name, value in sorted(files.items()) if not name.startswith(_OF_TRAINING)}
+    selected = {name: value for name, value in sorted(files.items()) if not name.startswith((*_OF_TRAINING, SUMS))}
     return {
         "checkpoint": {"folder": str(source if folder is None else folder), "files": selected}, "statistics": statistics
     }  # fmt: skip
 
 
+def _loaded(folder: Path) -> list[str]:
+    """Files of a checkpoint that a policy may be loaded from."""
+    names = (path.name for path in folder.iterdir() if path.suffix in _LOADED and path.is_file())
+    return sorted(name for name in names if not name.startswith(_OF_TRAINING))
+
+
+def _compare_checkpoint(found: Verification, part: Mapping[str, Any], checkpoint: Path | None) -> None:
+    """Every file that the policy was loaded from, none beside these, and the statistics."""
+    named = part.get("checkpoint")
+    files = named.get("files") if isinstance(named, Mapping) else None
+    if not isinstance(files, Mapping) or not files:
+        found.not_compared.append("checkpoint: no file of it was on the machine of the run, so none is compared.")
+        files = {}
+    folder = named.get("folder") if isinstance(named, Mapping) else None
+    place = checkpoint
+    if place is None and isinstance(folder, str) and folder:
+        place = Path(folder)
+    if place is None or not (place / _CONFIG).is_file():
+        text = "its folder" if place is None else brief(str(place), 200, quote=False)
+        hint = "Name its folder with --checkpoint."
+        found.not_compared.append(f"checkpoint: {text} is not here, or has no {_CONFIG}. {hint}")
+        found.not_compared.append(f"statistics: not without the checkpoint. {hint}")
+        return
+    if files:
+        here = _sums(place, [*files, *(name for name in _loaded(place) if name not in files)])
+        found.differences.extend(_differences("checkpoint", files, here))
+    if part.get("statistics") is None:
+        found.not_compared.append("statistics: the receipt has no digest of them.")
+    elif not (place / STATS_FILE).is_file():
+        found.not_compared.append(f"statistics: {place} has no {STATS_FILE}.")
+    else:
+        statistics = digest(NormStats.load(place / STATS_FILE).to_dict(), 64)
+        found.differences.extend(_differences("statistics", part["statistics"], statistics))
+
+
 def _sums(folder: Path, names: Iterable[str]) -> dict[str, str | None]:
-    return {name: file_sum(folder / name) if (folder / name).is_file() else None for name in names}
+    """SHA-256 of files of a folder, None of one that is not there.
+
+    Raises:
+        UserError: a name leads outside of the folder.
+    """
+    paths = {name: inside(folder, name) for name in names}
+    return {name: file_sum(path) if path.is_file() else None for name, path in paths.items()}
 
 
 def _version(package: str) -> str | None:

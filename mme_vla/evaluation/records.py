@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
+from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import parse_json, to_line, verified
@@ -67,6 +68,8 @@ class EpisodeRecord:
     model: name of the model (`framesamp_modul`). checkpoint: its step, or a name.
     model_seed: of the policy's noise; it does not reach the environment.
     task, episode: which episode of the split; seed, difficulty: the environment's, from the benchmark's metadata.
+    scene: digest of the scene's values and places (`mme_vla/envs/scene_digest.py`); `no values` of an environment that
+        gives none, `not built` where the episode ended before; None in records from before there were digests.
     outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error` (see `error`).
     steps: control steps executed, one an action but for planned motions. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
@@ -101,6 +104,7 @@ class EpisodeRecord:
     event: str | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     extra: dict[str, Any] = field(default_factory=dict)
+    scene: str | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
@@ -114,6 +118,11 @@ class EpisodeRecord:
     def run(self) -> RunKey:
         return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split,
                       self.composition, self.training, self.event)  # fmt: skip
+
+    @property
+    def named_scene(self) -> str | None:
+        """The digest of the scene; None where there is none."""
+        return None if self.scene in (NO_VALUES, NOT_BUILT) else self.scene
 
     @property
     def key(self) -> EpisodeKey:
@@ -141,7 +150,7 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     """One record for each episode of each run, in the order they first came.
 
     Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays. Different outcomes
-    of one episode are refused: the same checkpoint and seed were evaluated twice.
+    of one episode are refused: the same checkpoint and seed were evaluated twice. So are different scenes.
 
     records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
     """
@@ -158,7 +167,15 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
             "these are not the same benchmark; evaluate both from the same episode metadata.",
         )
-        if new.outcome in (old.outcome, "error"):
+        if new.outcome == "error":
+            continue
+        scenes = {new.named_scene, old.named_scene} - {None}
+        require(
+            conflicts != "refuse" or len(scenes) < 2,
+            f"{new.task} {new.episode} ({new.run}) was run in different scenes: {old.scene} at {old.when}, {new.scene} "
+            f"at {new.when}. Name one of the runs, or choose conflicts first or last.",
+        )
+        if new.outcome == old.outcome and len(scenes) < 2:
             continue
         require(
             conflicts != "refuse",

@@ -25,7 +25,7 @@ from mme_vla.evaluation.results.aggregate import (
     resampled_means,
     wilson,
 )
-from mme_vla.evaluation.results.compare import Comparison, compare, compare_all, holm
+from mme_vla.evaluation.results.compare import Comparison, compare, compare_all, compare_unpaired, holm, pair_methods
 from mme_vla.evaluation.results.paper import PaperMethod
 from mme_vla.evaluation.results.scopes import PAPER_ORDER, Protocol, scopes
 from mme_vla.nano.rows import CHOICES, Trained, Training
@@ -249,15 +249,22 @@ class Board:
         return self._compared(pairs)
 
     def _compared(self, pairs: Sequence[tuple[Row, Row]]) -> list[Comparison]:
-        made = compare_all([(first.method, second.method) for first, second in pairs], self._once)
+        made = compare_all([(first.method, second.method) for first, second in pairs], self._once, _compare)
         return [replace(c, interval=percentiles(self.sampled[c.first] - self.sampled[c.second])) for c in made]
+
+    @cached_property
+    def apart(self) -> list[Row]:
+        """The rows whose scenes are not known to be those of the board's own rows: compared by score, unpaired."""
+        reference = next((row for row in self.rows if not row.is_local), self.rows[0])
+        return [row for row in self.rows if pair_methods(row.method, reference.method).left_out]
 
     @cached_property
     def separations(self) -> list[Separation]:
         """Of each budget that several memories have, and each task."""
         made = []
         for budget in sorted({row.budget for row in self.rows}, key=lambda budget: (len(budget), budget)):
-            rows = [row for row in self.of_kind("policy") if row.budget == budget]
+            # Outcomes change places within a scene, so all must be of the same one.
+            rows = [row for row in self.of_kind("policy") if row.budget == budget and row not in self.apart]
             if len(rows) > 1:
                 tasks = [self._separation(budget, task, rows) for task in self.protocol.tasks]
                 over_policies = holm([separation.p for separation in tasks])
@@ -334,12 +341,12 @@ class Board:
             names[1], f"{100 * share:.0f} % of it", f"[{100 * low:.0f}, {100 * high:.0f}]", reached=share <= 0.5
         )
         suites = [(suite, tuple(self.protocol.choose("suite", suite))) for suite in self.protocol.suites]
-        compared = [compare(best.method, matched[0].method, replace(self._once, tasks=tasks)) for _, tasks in suites]
+        compared = [_compare(best.method, matched[0].method, replace(self._once, tasks=tasks)) for _, tasks in suites]
         intervals = [percentiles(np.subtract(*self.draws([best, matched[0]], tasks))) for _, tasks in suites]
         advantages = [
             Target(
                 f"significant advantage in {suite}", f"{c.difference:+.1f} points", f"[{low:+.1f}, {high:+.1f}]",
-                f"{c.wins} : {c.losses}, p = {p:.4f}", reached=p < 0.05 and low > 0,
+                f"{c.better_worse}, p = {p:.4f}", reached=p < 0.05 and low > 0,
             )
             for (suite, _), c, (low, high), p in zip(
                 suites, compared, intervals, holm([c.p for c in compared]), strict=True
@@ -378,6 +385,13 @@ def smallest_p(sizes: Sequence[int]) -> float:
     """The smallest p that memories of so many trainings can have: 1 / the number of ways to deal out the trainings."""
     alike = [factorial(count) for count in Counter(sizes).values()]  # memories of as many trainings may change places
     return prod(map(factorial, sizes)) * prod(alike) / factorial(sum(sizes))
+
+
+def _compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
+    """Scene by scene where all scenes are the same, else by score."""
+    if pair_methods(first, second).left_out:
+        return compare_unpaired(first, second, protocol)
+    return compare(first, second, protocol)
 
 
 def homogeneity(

@@ -152,6 +152,12 @@ def notes(board: Board) -> list[str]:
             f"Another training of a row changes its success by {noise:.1f} points (standard deviation). Intervals are "
             f"over scenes and trainings. Rows of one training: {single}."
         )
+    if board.apart:
+        lines.append(
+            f"{listed(row.name for row in board.apart)}: not known to be of the same scenes as the other rows, since "
+            "only some records name their scene, or they name different ones. These rows have the same tasks, numbers "
+            "and seeds, and are compared by score, unpaired."
+        )
     for row in board.rows:
         if errors := sum(run.outcomes["error"] for run in row.method.runs):
             lines.append(f"{row.name}: {errors} episodes ended in an error and count as failures.")

@@ -140,6 +140,7 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
             status = str(info["status"])
             if status != "ongoing":
                 break
+        scene = env.scene_digest
         steps = env.steps_counted  # type: ignore[union-attr]  # never the official environment
     finally:
         env.close()
@@ -147,6 +148,7 @@ def replay(spec: EpisodeSpec, max_steps: int) -> EpisodeRecord:
         PLANNER, "none", 0, spec.task, spec.episode, spec.seed, spec.difficulty,
         status if status in ("success", "fail", "timeout") else "fail", steps, split=spec.split,
         max_steps=max_steps, action_space="waypoint", extra={"status": status, "demonstrated": motions is not None},
+        scene=scene,
     )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Interval, Method, Results, aggregate, wilson
-from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all, why_unpaired
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.nano.evaluating import PLANNER
@@ -84,7 +84,10 @@ def compared(
     fixed = next(iter(methods)) if without is None else without
     others = [method for model, method in methods.items() if model != fixed]
     pairs = [(methods[fixed], other) if without is None else (other, methods[fixed]) for other in others]
-    return results, compare_all([pair for pair in pairs if common_episodes(*pair)], protocol)
+    results.notes += [why_unpaired(*pair) for pair in pairs if not common_episodes(*pair)]
+    comparisons = compare_all([pair for pair in pairs if common_episodes(*pair)], protocol)
+    results.notes += [note for comparison in comparisons for note in comparison.notes]
+    return results, comparisons
 
 
 def _method(results: Results, record: EpisodeRecord) -> Method:

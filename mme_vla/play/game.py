@@ -15,6 +15,7 @@ import numpy as np
 from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.scene_digest import NO_VALUES
 from mme_vla.errors import UserError, did_you_mean, require
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
@@ -196,6 +197,7 @@ class ChoiceSession:
         return EpisodeRecord(
             model=model, checkpoint=checkpoint, model_seed=model_seed, max_steps=max_steps, action_space="multi_choice",
             task=which.task, episode=which.episode, seed=which.seed, difficulty=which.difficulty, split=which.split,
+            scene=getattr(self.env, "scene_digest", NO_VALUES),
             outcome=self.status, steps=self.steps, error=self.error or None,
             seconds=Seconds(round(self._simulated, 3), round(self._policy_seconds, 3), round(self._clock() -
             self._begun, 3)), extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},

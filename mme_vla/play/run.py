@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.scene_digest import NOT_BUILT
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER
@@ -98,6 +99,7 @@ class PlayRun:
             model=identity.model, checkpoint=identity.checkpoint, model_seed=identity.model_seed,
             max_steps=identity.max_steps, action_space="multi_choice", task=which.task, episode=which.episode,
             seed=which.seed, difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
+            scene=NOT_BUILT,
             extra={"decisions": [], "ended_by": reason, **extra},
         )  # fmt: skip
         return self._keep(which, record)

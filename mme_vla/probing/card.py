@@ -10,6 +10,7 @@ import numpy as np
 from mme_vla.envs.base import environment
 from mme_vla.envs.make import make_env
 from mme_vla.errors import UserError, require
+from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
 from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.scopes import Protocol
@@ -160,14 +161,25 @@ def run_card(
     writing = _writing(policy, plan) if in_simulation and channel.chooses else None
     if isinstance(writing, str):
         notes.append(writing)
-    matched, repeated = _outcomes(folder / ONLINE / slug(UNPROBED.name), plan), _outcomes(folder / AGAIN, plan)
-    outcomes = {label: _outcomes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    unprobed, equal = _scenes(folder / ONLINE / slug(UNPROBED.name), plan), _scenes(folder / AGAIN, plan)
+    probed = {label: _scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
+    same = pair([unprobed, equal, *probed.values()])
+    notes += same.notes("The arms")
+    require(same.keys or not same.left_out, " ".join(same.notes("The arms")))
+    shown = {}
+    for name, records in others.items():
+        beside = pair([unprobed, records])
+        notes += beside.notes(f"references.{name}")
+        if beside.keys:
+            shown[name] = _mean(_success(records, beside.keys))
+    matched, repeated = (_success(side, same.keys) for side in (unprobed, equal))
+    outcomes = {label: _success(side, same.keys) for label, side in probed.items()}
     suite_of = environment(settings.env).suite_of
     suites = {job.task: suite for job in plan.jobs if (suite := suite_of(job.task))}
     card = replace(
         grade(matched, outcomes, repeated), model=facts.model, checkpoint=facts.checkpoint,
         suites=clock_scores(matched, outcomes, repeated, suites),
-        recovery=recovered, references=others, notes=notes, writing=writing if isinstance(writing, dict) else None,
+        recovery=recovered, references=shown, notes=notes, writing=writing if isinstance(writing, dict) else None,
     )  # fmt: skip
     write_card(card, folder)
     return card
@@ -266,18 +278,31 @@ def outcomes_of(records: Iterable[EpisodeRecord]) -> dict[EpisodeKey, float]:
     return {key: float(np.mean(values)) for key, values in runs.items()}
 
 
-def _outcomes(folder: Path, plan: ProbePlan) -> dict[EpisodeKey, float]:
-    """Success of the card's scenes in a folder of records."""
+Scenes = dict[EpisodeKey, list[EpisodeRecord]]
+"""The records of each scene that ended by itself."""
+
+
+def _success(records: Scenes, keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, float]:
+    """Success of these scenes."""
+    return outcomes_of(record for key in keys for record in records[key])
+
+
+def _scenes(folder: Path, plan: ProbePlan) -> Scenes:
+    """Records of the card's scenes in a folder; those that ended in an error are left out."""
     scenes = {(job.task, job.split, job.episode) for job in plan.jobs}
     records = read_folders(path for path in find_records([folder]) if path.parent == folder)
-    return outcomes_of(record for record in records if (record.task, record.split, record.episode) in scenes)
+    found: Scenes = {}
+    for record in records:
+        if record.outcome != "error" and (record.task, record.split, record.episode) in scenes:
+            found.setdefault(record.key, []).append(record)
+    return found
 
 
-def _reference(name: str, place: str, plan: ProbePlan) -> float:
-    """Mean success of another run on the scenes of the card."""
-    outcomes = _outcomes(Path(place).expanduser(), plan)
-    require(outcomes, f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same ones.")
-    return _mean(outcomes)
+def _reference(name: str, place: str, plan: ProbePlan) -> Scenes:
+    """Records of another run on the scenes of the card."""
+    records = _scenes(Path(place).expanduser(), plan)
+    require(records, f"references.{name}={place} holds no record of the card's scenes: evaluate it on the same ones.")
+    return records
 
 
 def _mean(values: Outcomes) -> float:

@@ -189,6 +189,24 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
         raise UserError(f"{path} cannot be read as {what}: {reason}.") from None
 
 
+def read_unpacked(path: Path, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
+    """Read a file of at most `limit` bytes, a file `*.xz` decompressed: all of its streams, and nothing else in it."""
+    data = read_bytes(path, what, limit)
+    if path.suffix != ".xz":
+        return data
+    parts, left, more = list[bytes](), limit, True
+    while more:
+        unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ)
+        with decoding(path, what, "Copy it again."):
+            parts.append(unpacker.decompress(data, left))
+        require(unpacker.eof, f"{path} is cut off, or has more than {limit:,} bytes of {what}. Copy it again.")
+        left -= len(parts[-1])
+        # Between streams the format allows null bytes, four at a time.
+        data = unpacker.unused_data.lstrip(b"\0")
+        more = bool(data)
+    return b"".join(parts)
+
+
 def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
     """Read a regular file of UTF-8 text of at most `limit` bytes; see `read_bytes`."""
     data = read_bytes(path, what, limit)
@@ -261,12 +279,7 @@ def read_lines[T](
         finite: raise an error for NaN and infinities.
     """
     # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
-    data = read_bytes(path, what, limit)
-    if path.suffix == ".xz":
-        unpacker = lzma.LZMADecompressor()
-        with decoding(path, what, "Copy it again."):
-            data = unpacker.decompress(data, limit)
-        require(unpacker.eof, f"{path} is cut off, or has more than {limit:,} bytes of {what}. Copy it again.")
+    data = read_unpacked(path, what, limit)
     *complete, last = data.split(b"\n")
     values = []
     for number, line in enumerate([*complete, last], start=1):

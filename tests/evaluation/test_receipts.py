@@ -3,9 +3,14 @@
 import json
 import lzma
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+pytest.importorskip("mani_skill", reason="scenes are built, which needs the extra 'sim'")
 
 from helpers.rollout_fakes import quick_policy
 from mme_vla import UserError
@@ -17,6 +22,8 @@ from mme_vla.evaluation.rollout.evaluation import checkpoint_label, facts_of, ru
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import RecordLog, claim_run, fingerprint
 from mme_vla.policy.base import Policy
+from mme_vla.policy.training_identity import TrainingIdentity
+from mme_vla.utils import to_json, with_checksum
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +47,7 @@ def run(folder: Path, checkpoint: Path, episodes: range = range(3), execute: int
             log.append(
                 EpisodeRecord(
                     facts.model, checkpoint_label(str(checkpoint)), 42, spec.task, number, spec.seed, spec.difficulty,
-                    outcome, 9,
+                    outcome, 9, scene=environment("mme_vla").scene_digest(spec),
                 )
             )  # fmt: skip
     return folder / "receipt.json"
@@ -48,7 +55,7 @@ def run(folder: Path, checkpoint: Path, episodes: range = range(3), execute: int
 
 def test_a_receipt_agrees_with_its_run(checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = run(tmp_path, checkpoint)
-    assert receipts.verify(path) == ([], [])
+    assert receipts.verify(path) == ([], [], [])
     content = receipts.read_receipt(path)
     assert content["score"] == {"VideoUnmask": {"success": 1, "fail": 2, "timeout": 0, "error": 0}}
     assert (content["settings"]["execute"], content["settings"]["flow_steps"]) == (16, 10)
@@ -60,7 +67,7 @@ def test_a_receipt_agrees_with_its_run(checkpoint: Path, tmp_path: Path, capsys:
     records = tmp_path / "episodes.jsonl"
     records.with_name("episodes.jsonl.xz").write_bytes(lzma.compress(records.read_bytes()))
     records.unlink()
-    assert receipts.verify(path) == ([], []), "as records are published"
+    assert receipts.verify(path) == ([], [], []), "as records are published"
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "norm_stats.json"])
@@ -70,7 +77,7 @@ def test_a_changed_byte_of_a_checkpoint_is_named(name: str, checkpoint: Path, tm
     content = bytearray((copy / name).read_bytes())
     content[-1] ^= 1 if name == "model.safetensors" else ord("\n") ^ ord(" ")
     (copy / name).write_bytes(content)
-    differences, _ = receipts.verify(path, copy)
+    differences, *_ = receipts.verify(path, copy)
     assert len(differences) == 1 and differences[0].startswith(f"checkpoint.{name}: ")
 
 
@@ -92,7 +99,7 @@ def test_another_chunk_length_is_named(checkpoint: Path, tmp_path: Path) -> None
     path = run(tmp_path / "sixteen", checkpoint)
     other = run(tmp_path / "eight", checkpoint, execute=8)
     other.write_bytes(path.read_bytes())
-    differences, _ = receipts.verify(other)
+    differences, *_ = receipts.verify(other)
     assert "settings.execute: 16 in the receipt, 8 here" in differences
 
 
@@ -104,7 +111,7 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
     changed = {**json.loads(lines[0]), "outcome": "success", "seed": first.seed + 1}
     changed.pop("crc32")
     records.write_text("\n".join([json.dumps(changed), *lines[1:]]) + "\n")
-    differences, _ = receipts.verify(path)
+    differences, *_ = receipts.verify(path)
     starts = [line.split(":")[0] for line in differences]
     assert {"records.sha256", "score.VideoUnmask.success", "scenes", "scene VideoUnmask 0"} <= set(starts)
     other = tmp_path / "receipt-of-something-else.json"
@@ -116,7 +123,7 @@ def test_changed_records_scenes_and_receipts_are_named(checkpoint: Path, tmp_pat
         receipts.verify(path)
 
 
-def test_scenes_of_an_environment_that_is_not_here_are_a_note(checkpoint: Path, tmp_path: Path) -> None:
+def test_scenes_of_an_environment_that_is_not_here_are_not_compared(checkpoint: Path, tmp_path: Path) -> None:
     path = run(tmp_path, checkpoint)
     for name in ("receipt.json", "run.json"):
         content = json.loads((tmp_path / name).read_text())
@@ -125,5 +132,210 @@ def test_scenes_of_an_environment_that_is_not_here_are_a_note(checkpoint: Path, 
         if name == "run.json":
             content["fingerprint"] = fingerprint(content["settings"])
         (tmp_path / name).write_text(json.dumps(content))
-    differences, notes = receipts.verify(path)
-    assert not differences and any(note.startswith("scenes: not compared") for note in notes)
+    result = receipts.verify(path)
+    assert not result.differences and result.word == "not compared"
+    assert any(line.startswith("scenes: ") for line in result.not_compared)
+
+
+def test_a_receipt_is_named_after_its_records_packed_or_not() -> None:
+    names = {"episodes.jsonl": "receipt.json", "episodes.jsonl.xz": "receipt.json"}
+    names |= {"episodes-0of4.jsonl": "receipt-0of4.json", "episodes-0of4.jsonl.xz": "receipt-0of4.json"}
+    assert {name: receipts.receipt_file(Path(name)).name for name in names} == names
+
+
+# Absence is no agreement ------------------------------------------------------------------------------------------
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Change a receipt or `run.json` as a forger does, who brings its checksum and fingerprint in order."""
+    content = json.loads(path.read_text())
+    content.pop("crc32")
+    change(content)
+    if "fingerprint" in content:
+        content["fingerprint"] = fingerprint(content["settings"])
+    path.write_text(json.dumps(with_checksum(content)))
+
+
+def rewrite_records(path: Path, **fields: Any) -> None:
+    """Change every record, and bring the receipt's digests and score in order."""
+    records = path.with_name("episodes.jsonl")
+    lines = [replace(EpisodeRecord.from_json(line), **fields) for line in records.read_text().splitlines()]
+    records.write_text("".join(line.to_json() + "\n" for line in lines))
+    rewrite(path, lambda content: content.update(to_json(receipts._score(records, content["settings"]))))
+
+
+def first(content: dict[str, Any]) -> dict[str, Any]:
+    return content["conditions"][0]
+
+
+ABSENCES: dict[str, tuple[Callable[[dict[str, Any]], object], set[str]]] = {
+    "no condition": (
+        lambda c: c.update(conditions=[]),
+        {"code", "simulator", "renderer", "libraries", "checkpoint", "statistics"},
+    ),
+    "no files of the checkpoint": (lambda c: first(c)["checkpoint"].update(files={}), {"checkpoint"}),
+    "no checkpoint": (lambda c: first(c).pop("checkpoint"), {"checkpoint", "statistics"}),
+    "another folder": (lambda c: first(c)["checkpoint"].update(folder="nowhere"), {"checkpoint", "statistics"}),
+    "no folder": (lambda c: first(c)["checkpoint"].update(folder=""), {"checkpoint", "statistics"}),
+    "no statistics": (lambda c: first(c).pop("statistics"), {"statistics"}),
+    "no code": (lambda c: first(c).pop("code"), {"code"}),
+    "code of nothing": (
+        lambda c: first(c)["code"].update(covers=[], sha256=receipts._code([])),
+        {f"code.{name}" for name in receipts.CODE},
+    ),
+    "no version of the library": (lambda c: first(c)["code"].pop("mme-vla"), {"code.mme-vla"}),
+    "no simulator": (lambda c: first(c).update(simulator={}), {"simulator"}),
+    "no PyTorch": (lambda c: first(c)["libraries"].pop("torch"), {"libraries"}),
+    "no renderer": (lambda c: first(c).pop("renderer"), {"renderer"}),
+    "no hardware": (lambda c: first(c).pop("hardware"), {"hardware"}),
+    "no file of records": (lambda c: c.update(records={}), {"records"}),
+}
+
+
+@pytest.mark.parametrize("change, expected", ABSENCES.values(), ids=ABSENCES)
+def test_what_a_receipt_lacks_is_not_compared(
+    change: Callable[[dict[str, Any]], object], expected: set[str], finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rewrite(finished, lambda content: (change(content), None)[1])
+    result = receipts.verify(finished, build=True)
+    assert {line.split(":")[0] for line in result.not_compared} == expected
+    assert (result.differences, result.word) == ([], "not compared")
+    with pytest.raises(SystemExit) as ended:
+        main(["verify", str(finished)])
+    assert ended.value.code == 3 and "not compared: " in capsys.readouterr().out
+
+
+@pytest.fixture
+def finished(checkpoint: Path, tmp_path: Path) -> Path:
+    """A receipt that agrees."""
+    return run(tmp_path, checkpoint, range(1))
+
+
+def test_a_missing_run_and_scenes_that_are_not_built_are_not_compared(finished: Path) -> None:
+    result = receipts.verify(finished, build=False)
+    assert result.word == "not compared" and [line[:7] for line in result.not_compared] == ["scenes:"]
+    finished.with_name("run.json").unlink()
+    assert [line.split(":")[0] for line in receipts.verify(finished).not_compared] == ["settings"]
+
+
+@pytest.mark.parametrize("scene, reason", [(None, "earlier versions"), ("no values", "gave no values"),
+                                           ("not built", "ended before")])  # fmt: skip
+def test_episodes_whose_scene_is_not_named_are_not_compared(scene: str | None, reason: str, finished: Path) -> None:
+    rewrite_records(finished, scene=scene)
+    result = receipts.verify(finished)
+    assert result.word == "not compared" and reason in result.not_compared[0]
+
+
+def test_tasks_that_are_not_here_are_not_compared(finished: Path) -> None:
+    rewrite_records(finished, task="NoTaskOfThisName")
+    result = receipts.verify(finished)
+    assert result.word == "not compared" and "NoTaskOfThisName" in result.not_compared[0]
+
+
+# Records that contradict their settings, and other scenes ---------------------------------------------------------
+
+
+def test_another_scene_of_the_same_seed_is_noticed(finished: Path) -> None:
+    """Records, receipt and digests fit each other: only building the scene tells that it was another."""
+    rewrite_records(finished, scene="0123456789abcdef")
+    result = receipts.verify(finished)
+    assert result.word == "differs"
+    assert [line.split(":")[0] for line in result.differences] == ["scene VideoUnmask 0"]
+    rewrite(finished, lambda content: content.update(scene_digests={}))
+    assert any(line.startswith("scene_digests") for line in receipts.verify(finished).differences)
+
+
+@pytest.mark.parametrize("fields, name", [
+    ({"model": "another"}, "model"), ({"model_seed": 43}, "model_seed"), ({"max_steps": 9999}, "max_steps"),
+    ({"steps": 5000}, "steps"), ({"steps": -1}, "steps"), ({"checkpoint": 7}, "checkpoint"),
+    ({"event": "pause:64"}, "event"), ({"subgoal": "oracle"}, "subgoal"), ({"extra": {"env": "another"}}, "env"),
+    ({"training": TrainingIdentity(1, "r", "d", "w")}, "training"),
+], ids=str)  # fmt: skip
+def test_records_of_other_settings_are_noticed(fields: dict[str, Any], name: str, finished: Path) -> None:
+    rewrite_records(finished, **fields)
+    assert [line.split(":")[0] for line in receipts.verify(finished).differences] == [f"records.{name}"]
+
+
+@pytest.mark.parametrize("key, value", [("seed", 43), ("max_steps", 1200), ("model", "another"), ("split", "val")])
+@pytest.mark.parametrize("with_run", [True, False])
+def test_settings_that_were_changed_everywhere_but_in_the_records_are_noticed(
+    key: str, value: Any, with_run: bool, finished: Path
+) -> None:
+    beside = finished.with_name("run.json")
+    for path in (finished, beside):
+        rewrite(path, lambda content: content["settings"].update({key: value}))
+    if not with_run:
+        beside.unlink()
+    field = {"seed": "model_seed"}.get(key, key)
+    assert f"records.{field}" in [line.split(":")[0] for line in receipts.verify(finished).differences]
+
+
+def test_the_time_that_events_hold_the_robot_is_added_to_the_limit(finished: Path) -> None:
+    for path in (finished, finished.with_name("run.json")):
+        rewrite(path, lambda content: content["settings"].update(event="pause:100"))
+    rewrite_records(finished, event="pause:100", steps=1402)
+    assert receipts.verify(finished).differences == []
+    rewrite_records(finished, event="pause:100", steps=1403)
+    assert [line.split(":")[0] for line in receipts.verify(finished).differences] == ["records.steps"]
+
+
+def test_a_file_beside_those_that_were_loaded_is_noticed(finished: Path, checkpoint: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(checkpoint, tmp_path / "copy")
+    (copy / "notes.md").write_text("read by nobody")
+    assert receipts.verify(finished, copy).word == "agrees"
+    (copy / "model.safetensors.index.json").write_text("{}")
+    differences = receipts.verify(finished, copy).differences
+    assert len(differences) == 1 and "model.safetensors.index.json: None in the receipt" in differences[0]
+
+
+@pytest.mark.parametrize("change", [
+    lambda c: first(c)["checkpoint"]["files"].update({"../../secret": "0"}),
+    lambda c: first(c)["checkpoint"]["files"].update({"/etc/passwd": "0"}),
+    lambda c: c["records"].update(file="/etc/passwd"),
+    lambda c: c["records"].update(file="../episodes.jsonl"),
+])  # fmt: skip
+def test_names_that_lead_outside_are_refused(change: Callable[[dict[str, Any]], None], finished: Path) -> None:
+    rewrite(finished, change)
+    with pytest.raises(UserError, match="lies outside of it"):
+        receipts.verify(finished)
+
+
+@pytest.mark.parametrize("change", [
+    lambda c: c.update(conditions="abc"), lambda c: c.update(conditions=[1]), lambda c: c.update(settings=[]),
+    lambda c: c.update(records="x"), lambda c: c.update(score=5),
+])  # fmt: skip
+def test_parts_of_another_kind_are_refused(change: Callable[[dict[str, Any]], None], finished: Path) -> None:
+    rewrite(finished, change)
+    with pytest.raises(UserError, match="is no receipt of an evaluation"):
+        receipts.verify(finished)
+
+
+def test_records_of_several_streams_are_read_whole(checkpoint: Path, tmp_path: Path) -> None:
+    path = run(tmp_path, checkpoint, range(2))
+    records = tmp_path / "episodes.jsonl"
+    parts = records.read_bytes().splitlines(keepends=True)
+    records.with_name("episodes.jsonl.xz").write_bytes(b"".join(map(lzma.compress, parts)))
+    records.unlink()
+    assert receipts.verify(path) == ([], [], [])
+
+
+# The digest of the code -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name, counts", [
+    ("memory/base.py", True), ("envs/task.py", True), ("evaluation/rollout/runner.py", True),
+    ("cli/results.py", False), ("evaluation/results/plots.py", False), ("play/page.py", False),
+])  # fmt: skip
+def test_the_digest_of_the_code_covers_what_can_change_a_result(name: str, counts: bool) -> None:
+    root = Path(receipts.__file__).parents[1]
+    covered = {path.relative_to(root).as_posix() for part in receipts.CODE for path in (root / part).rglob("*.py")}
+    assert (name in covered) is counts
+    assert all(list((root / part).rglob("*.py")) for part in receipts.CODE), "a package was moved"
+
+
+def test_a_receipt_that_digests_every_file_says_what_it_cannot_tell(finished: Path) -> None:
+    rewrite(finished, lambda content: first(content).update(code={"mme-vla": "0.1.0", "files": receipts._code([""])}))
+    assert receipts.verify(finished).word == "agrees"
+    rewrite(finished, lambda content: first(content)["code"].update(files="0" * 64))
+    result = receipts.verify(finished)
+    assert result.word == "not compared" and "every file" in result.not_compared[0]

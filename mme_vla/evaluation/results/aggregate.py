@@ -16,6 +16,7 @@ import numpy as np
 from mme_vla.envs.metadata import is_other
 from mme_vla.envs.rows import DIFFICULTIES
 from mme_vla.errors import UserError, did_you_mean, require
+from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
@@ -277,16 +278,21 @@ def aggregate(
 
 
 def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
-    """Of each run: how many episodes ended twice or more by themselves, and how many of those not always alike."""
-    outcomes: dict[tuple[RunKey, EpisodeKey], list[str]] = {}
+    """Of each run: how many episodes ended twice or more by themselves, and how many of those not always alike.
+
+    An episode whose records are not of the same scene was not repeated.
+    """
+    episodes: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
     for record in records:
         if record.outcome != "error":
-            outcomes.setdefault((record.run, record.key), []).append(record.outcome)
+            episodes.setdefault(record.run, {}).setdefault(record.key, []).append(record)
     counts: dict[RunKey, tuple[int, int]] = {}
-    for (run, _), results in outcomes.items():
-        if len(results) > 1:
-            repeated, flipped = counts.get(run, (0, 0))
-            counts[run] = repeated + 1, flipped + (len(set(results)) > 1)
+    for run, of_run in episodes.items():
+        for key in pair([of_run]).keys:
+            results = [record.outcome for record in of_run[key]]
+            if len(results) > 1:
+                repeated, flipped = counts.get(run, (0, 0))
+                counts[run] = repeated + 1, flipped + (len(set(results)) > 1)
     return counts
 
 
@@ -437,6 +443,13 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
         if method.paper and limits != {MAX_STEPS}:
             limit_text = ", ".join(map(str, sorted(limits)))
             notes.append(f"{method.label} ran with a limit of {limit_text} steps; the paper's is {MAX_STEPS}.")
+        if len(method.runs) > 1:
+            same = pair([{key: [record] for key, record in run.records.items()} for run in method.runs])
+            if same.left_out:
+                notes.append(
+                    f"{method.label}: its runs are not known to be of the same scenes in {same.left_out} episodes, whose "
+                    "scenes differ or are named in some runs only; its mean is over all of them."
+                )
     for split in sorted({run.key.split for method in methods for run in method.runs}):
         if is_other(split):
             notes.append(

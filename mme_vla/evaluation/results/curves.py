@@ -10,6 +10,7 @@ import numpy as np
 from mme_vla.envs.metadata import BASE, read_variant
 from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
 from mme_vla.errors import require
+from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Interval, Results, wilson
 from mme_vla.evaluation.results.plots import COLOURS, figure, svg
@@ -58,13 +59,18 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
 
 
 def curves_of(
-    records: Sequence[EpisodeRecord], place: Callable[[EpisodeRecord], Place | None], confidence: float = 0.95
+    records: Sequence[EpisodeRecord],
+    place: Callable[[EpisodeRecord], Place | None],
+    confidence: float = 0.95,
+    same_scenes: bool = False,
 ) -> Curves:
     """Success over every dial.
 
-    A point counts the episodes that the model has at every place of the dial, so that one curve is of the same scenes.
+    A point counts the episodes that the model has at every place of the dial, so that one curve is of the same episodes.
 
-    records: merged. place: where a record lies; None for a record that lies on none, or at the zero.
+    records: merged. place: where a record lies; None for a record that lies on none, or at the zero. same_scenes:
+        whether a dial leaves the scene as it is, so that only equal scenes are counted; one that changes the scene
+        keeps the episode's number and seed alone.
     """
     groups: dict[tuple[str, str, str, float], dict[float, list[EpisodeRecord]]] = {}
     for record in records:
@@ -77,12 +83,21 @@ def curves_of(
         if baseline and zero not in places:
             places[zero] = baseline
         common = set.intersection(*({r.episode for r in there} for there in places.values()))
+        if same_scenes:
+            common = set(pair([_by_episode(there) for there in places.values()]).keys)
         curves[run, task, dial] = [
             _point(turned, [r for r in there if r.episode in common], confidence)
             for turned, there in sorted(places.items())
             if common
         ]
     return {name: points for name, points in curves.items() if points}
+
+
+def _by_episode(records: Sequence[EpisodeRecord]) -> dict[int, list[EpisodeRecord]]:
+    episodes: dict[int, list[EpisodeRecord]] = {}
+    for record in records:
+        episodes.setdefault(record.episode, []).append(record)
+    return episodes
 
 
 def _point(turned: float, records: Sequence[EpisodeRecord], confidence: float) -> Point:

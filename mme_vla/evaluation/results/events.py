@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from mme_vla.errors import require
+from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, merge
 from mme_vla.evaluation.results.aggregate import Method, Results
 from mme_vla.evaluation.results.compare import show_p, sign_test
@@ -35,18 +36,27 @@ def matched_methods(results: Results) -> list[tuple[Method, Method]]:
     return [(m, baseline[identity(m)]) for m in results.methods if m.event is not None and identity(m) in baseline]
 
 
-def matched_pairs(records: Sequence[EpisodeRecord]) -> dict[RunKey, list[Pair]]:
-    """The pairs of every run with events; an episode that ended in an error has none.
+def matched_pairs(records: Sequence[EpisodeRecord]) -> tuple[dict[RunKey, list[Pair]], list[str]]:
+    """The pairs of every run with events, and notes on episodes that were not paired for their scenes.
+
+    An episode that ended in an error has no pair.
 
     records: merged, of both arms.
     """
-    there: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {(r.run, r.key): r for r in records if r.outcome != "error"}
-    pairs: dict[RunKey, list[Pair]] = {}
-    for (run, key), record in there.items():
-        baseline = there.get((run._replace(event=None), key))
-        if run.event is not None and baseline is not None:
-            pairs.setdefault(run, []).append((record, baseline))
-    return pairs
+    runs: dict[RunKey, dict[EpisodeKey, list[EpisodeRecord]]] = {}
+    for record in records:
+        if record.outcome != "error":
+            runs.setdefault(record.run, {})[record.key] = [record]
+    pairs, notes = dict[RunKey, list[Pair]](), list[str]()
+    for run, mine in runs.items():
+        baseline = runs.get(run._replace(event=None), {})
+        if run.event is None or not baseline:
+            continue
+        pairing = pair([mine, baseline])
+        notes += pairing.notes(str(run))
+        if pairing.keys:
+            pairs[run] = [(mine[key][0], baseline[key][0]) for key in pairing.keys]
+    return pairs, notes
 
 
 def did_not_act(record: EpisodeRecord) -> list[str]:
@@ -69,7 +79,8 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
     merged = merge(records, conflicts)
     require(any(record.event for record in merged), NO_EVENTS)
     groups: dict[RunKey, list[Pair]] = {}
-    for run, pairs in matched_pairs(merged).items():
+    matched, notes = matched_pairs(merged)
+    for run, pairs in matched.items():
         groups.setdefault(run._replace(training=_recipe(run.training)), []).extend(pairs)
     rows, rules = [], set()
     for run, pairs in groups.items():
@@ -82,7 +93,7 @@ def event_table(records: Sequence[EpisodeRecord], conflicts: str = "refuse") -> 
         "run", "event", "task", "trainings", "pairs", "without (%)", "with (%)", "kept", "lost", "gained", "p",
         "did not act",
     ]  # fmt: skip
-    return Table("Events beside their matched arms", columns, rows, rules - {len(rows)})
+    return Table("Events beside their matched arms", columns, rows, rules - {len(rows)}, notes=notes)
 
 
 def _recipe(training: TrainingIdentity | None) -> TrainingIdentity | None:
@@ -112,7 +123,7 @@ def _counts(pairs: Sequence[Pair]) -> list[str]:
 def event_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, conflicts: str = "refuse") -> Curves:
     """Success over the number of every event that has one; the plain run is at its neutral number."""
     merged = [replace(record, training=_recipe(record.training)) for record in merge(records, conflicts)]
-    return curves_of(merged, _place, confidence)
+    return curves_of(merged, _place, confidence, same_scenes=True)
 
 
 def _place(record: EpisodeRecord) -> Place | None:

@@ -14,6 +14,8 @@ from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.metadata import BASE, HARD, TWIN, read_variant
 from mme_vla.envs.rows import OOD, TIERS
+from mme_vla.envs.scene_digest import scene_digest
+from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, by_run, merge
 from mme_vla.evaluation.results.aggregate import Interval, repeated_episodes, wilson
 from mme_vla.evaluation.results.curves import curve_figure
@@ -123,15 +125,19 @@ def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
     """Each split beside its twin, on their common episodes; None without a pair.
 
     In the twin what is to be remembered stays in view: what fails there is lost by control, and the difference to the
-    split itself by memory. Flips are episodes that were run more than once alike and ended otherwise.
+    split itself by memory. Flips are episodes that were run more than once alike and ended otherwise. Episodes whose
+    scenes are not the same are left out, and counted in the table's notes.
     """
     merged = merge(records, conflicts)
     repeats = repeated_episodes(records)
     runs = by_run(merged)
-    rows = []
+    rows, notes = [], list[str]()
     for run, members in runs.items():
         twin = run._replace(split=TWIN if run.split == BASE else f"{TWIN}:{run.split}")
-        pairs = _common(members, runs.get(twin, []))
+        sides = [{record.key: [record] for record in side} for side in (members, runs.get(twin, []))]
+        pairing = pair(sides)
+        notes += pairing.notes(f"{run} and its twin")
+        pairs = [(sides[0][key][0], sides[1][key][0]) for key in pairing.keys]
         if not pairs:
             continue
         base, visible = (Share.of(side, confidence) for side in zip(*pairs, strict=True))
@@ -145,24 +151,18 @@ def twin_table(records: Sequence[EpisodeRecord], confidence: float = 0.95, confl
         ])  # fmt: skip
     columns = ["run", "episodes", "split (%)", "twin (%)", "lost by memory", "lost by control", "gained : lost",
                "flips of equal runs"]  # fmt: skip
-    return Table("Twins: what memory loses and what control loses", columns, rows) if rows else None
-
-
-def _common(
-    first: Sequence[EpisodeRecord], second: Sequence[EpisodeRecord]
-) -> list[tuple[EpisodeRecord, EpisodeRecord]]:
-    others = {record.key: record for record in second}
-    return [(record, others[record.key]) for record in first if record.key in others]
+    title = "Twins: what memory loses and what control loses"
+    return Table(title, columns, rows, notes=notes) if rows or notes else None
 
 
 # Extrapolation ----------------------------------------------------------------------------------------------------
 
 
 @cache
-def amount_of(task: str, split: str, key: EpisodeKey) -> int | None:
+def amount_of(task: str, split: str, key: EpisodeKey, scene: str | None = None) -> int | None:
     """How often, how many or how long an episode is, by `AMOUNTS`; scenes without a row are built for that.
 
-    None where the scene cannot be built.
+    None where the scene cannot be built, or is another one here than the one with the digest `scene`.
     """
     from mme_vla.envs.scene.placement import SceneError
 
@@ -174,6 +174,8 @@ def amount_of(task: str, split: str, key: EpisodeKey) -> int | None:
         try:
             env.reset()
             values = env.scene_values()["spec"]
+            if scene is not None and scene_digest(env.placed_values()) != scene:
+                return None
         except SceneError:
             return None
         finally:
@@ -195,14 +197,14 @@ def extrapolation(
 ) -> Extrapolation:
     """Success against the amount of what grows, over all splits of a model: training, test, stress and OOD.
 
-    Twins, splits with sessions and scenes that cannot be built are left out.
+    Twins, splits with sessions, and scenes that cannot be built or are other ones here are left out.
     """
     groups: dict[tuple[str, str], dict[int, list[EpisodeRecord]]] = {}
     for record in merge(records, conflicts):
         variant = read_variant(record.split)
         if record.task not in AMOUNTS or (variant is not None and (variant.twin or variant.sessions)):
             continue
-        amount = amount_of(record.task, record.split, record.key)
+        amount = amount_of(record.task, record.split, record.key, record.named_scene)
         if amount is None:
             continue
         at = str(record.run._replace(split=BASE)), record.task

@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class Table:
-    """A table of text. rules: rows before which a line is printed. strong: rows in bold."""
+    """A table of text. rules: rows before which a line is printed. strong: rows in bold. notes: sentences below it."""
 
     title: str
     columns: Sequence[str]
     rows: list[list[str]]
     rules: set[int] = field(default_factory=set)
     strong: set[int] = field(default_factory=set)
+    notes: Sequence[str] = ()
 
 
 def task_tables(
@@ -144,7 +145,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> Table:
         paired = f"{c.episodes}" if c.episodes == c.expected else f"{c.episodes} of {c.expected}"
         rows.append([
             f"{c.first} − {c.second}", paired, f"{c.first_rate:.2f}", f"{c.second_rate:.2f}", f"{c.difference:+.2f}",
-            f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]", f"{c.wins} : {c.losses}", show_p(c.corrected),
+            f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]", c.better_worse, show_p(c.corrected),
             "yes" if c.significant else "no",
         ])  # fmt: skip
     columns = ["pair", "episodes", "first", "second", "difference", "interval", "better : worse", "p", "significant"]

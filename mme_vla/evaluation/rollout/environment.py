@@ -20,6 +20,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.oracle import oracle_of
+from mme_vla.envs.scene_digest import NO_VALUES
 from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
@@ -105,7 +106,7 @@ class ChunkEnv:
         self._clock.watch(self._env)
 
     def reset(self, draw: RenderRequest | None = None) -> tuple[Observation, dict[str, Any]]:
-        """All frames of the conditioning video, the current one last, and the report.
+        """All frames of the conditioning video, the current one last, and the report, with the `scene`'s digest.
 
         draw: the requested images; by default all.
         """
@@ -118,7 +119,8 @@ class ChunkEnv:
         self._note_subgoal(info)
         self._draw(frames, count, demo=count - 1)
         self._returned = frames.leave(draw, 0)
-        return frames.observation(), self._report(info)
+        scene = getattr(self._env, "scene_digest", NO_VALUES)  # environments of other packages do not know it
+        return frames.observation(), self._report(info) | {"scene": scene}
 
     def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute actions one after the other until they, or the episode, are over.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.action_space import read_options
+from mme_vla.envs.scene_digest import NOT_BUILT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
@@ -56,6 +57,8 @@ class RunningEpisode:
         self.steps = self.chunks = 0
         self.video_frames = 0
         self.video = ""
+        self.scene = NOT_BUILT
+        """Digest of the scene, once it is built."""
         self.process: dict[str, Any] = {}
         """Where the chain of sub-tasks broke, once the episode is over; empty where it is not reported."""
         self.redrawn: int | None = None

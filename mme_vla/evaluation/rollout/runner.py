@@ -175,6 +175,7 @@ class Rollout:
         running = self._running[reply.worker]
         self._scheduler.later.pop(running, None)
         running.add_env_seconds(reply.info)
+        running.scene = reply.info.get("scene", running.scene)
         if reply.info.get("exception_type") == "UserError" and reply.crashed:
             raise UserError(str(reply.info.get("error_message")))
         if reply.done:
@@ -278,7 +279,7 @@ class Rollout:
         robot = self.policy.embodiment
         record = EpisodeRecord(
             **vars(self.facts), action_space=robot.action.answers or robot.name, task=job.task, episode=job.episode,
-            seed=spec.seed, difficulty=spec.difficulty,
+            seed=spec.seed, difficulty=spec.difficulty, scene=running.scene,
             outcome=outcome, steps=running.steps, seconds=running.seconds, error=error if outcome == "error" else None,
             extra={
                 "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,

@@ -1,0 +1,74 @@
+"""Which episodes of several runs are of the same scenes, and may be paired: every comparison asks here."""
+
+from collections import Counter
+from collections.abc import Collection, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from mme_vla.evaluation.records import EpisodeRecord
+
+@dataclass(frozen=True)
+class Pairing[Key: Hashable]:
+    """What may be paired, and what was left out.
+
+    keys: of the episodes whose scenes are the same in all runs, in the order of the first run. unnamed: of these, how
+    many have no digest in any run, so that task, number and seed alone say that they are the same. other: task → how
+    many were left out because their scenes differ. mixed: task → because only some of the runs name the scene.
+    """
+
+    keys: tuple[Key, ...]
+    unnamed: int
+    other: Mapping[str, int]
+    mixed: Mapping[str, int]
+
+    @property
+    def left_out(self) -> int:
+        """How many episodes are common by task and number, and are not paired."""
+        return sum(self.other.values()) + sum(self.mixed.values())
+
+    def notes(self, what: str) -> list[str]:
+        """What a reader has to know, one sentence each. what: which runs are compared."""
+        lines = []
+        if self.other:
+            lines.append(
+                f"{what}: {sum(self.other.values())} episodes are not paired, for their scenes are different ones in "
+                f"these runs ({_by_task(self.other)}): they were built by other versions or on other machines."
+            )
+        if self.mixed:
+            lines.append(
+                f"{what}: {sum(self.mixed.values())} episodes are not paired, for only some of the runs name their "
+                f"scene ({_by_task(self.mixed)}): evaluate the others again with this version."
+            )
+        if self.unnamed:
+            lines.append(
+                f"{what}: {self.unnamed} of {len(self.keys)} paired episodes have no digest of their scene on either "
+                "side: they are taken for the same by task, number and seed."
+            )
+        return lines
+
+
+def pair[Key: Hashable](sides: Sequence[Mapping[Key, Collection[EpisodeRecord]]]) -> Pairing[Key]:
+    """Pair the episodes that all sides have and whose scenes are the same in all their records.
+
+    Scenes are the same where all records have equal digests, or where none has one; and where their seeds are equal.
+
+    Args:
+        sides: of each run, its records by what makes an episode the same, such as task and number.
+    """
+    first, *others = sides
+    keys, unnamed, other, mixed = list[Key](), 0, Counter[str](), Counter[str]()
+    for key, records in first.items():
+        if not all(key in side for side in others):
+            continue
+        every = [*records, *(record for side in others for record in side[key])]
+        scenes, task = {record.named_scene for record in every}, every[0].task
+        if len(scenes - {None}) > 1 or len({record.seed for record in every}) > 1:
+            other[task] += 1
+        elif len(scenes) > 1:
+            mixed[task] += 1
+        else:
+            keys.append(key)
+            unnamed += scenes == {None}
+    return Pairing(tuple(keys), unnamed, dict(other), dict(mixed))
+
+
+def _by_task(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{task} {count}" for task, count in counts.items())
