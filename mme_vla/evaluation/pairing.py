@@ -5,6 +5,7 @@ from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from mme_vla.evaluation.records import EpisodeRecord
 
+
 @dataclass(frozen=True)
 class Pairing[Key: Hashable]:
     """What may be paired, and what was left out.

@@ -208,7 +208,9 @@ def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], con
         if key in settings:
             expected[field] = settings[key]
         else:
-            found.not_compared.append(f"settings.{key}: the receipt does not name it, so no record is compared with it.")
+            found.not_compared.append(
+                f"settings.{key}: the receipt does not name it, so no record is compared with it."
+            )
     subgoal = settings.get("subgoal")
     expected["subgoal"] = subgoal.get("name") if isinstance(subgoal, Mapping) else subgoal
     expected["event"] = settings.get("event")

@@ -50,13 +50,22 @@ def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """The safetensors files that hold a folder's weights."""
+    """The safetensors files that hold a folder's weights.
+
+    Raises:
+        UserError: there are none, an index names no files, or there is a single file beside an index of other files.
+    """
     if (folder / INDEX).is_file():
         check_sums(folder, [INDEX])
         table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
         names = set(table.values()) if isinstance(table, dict) else set()
         texts = names and all(isinstance(name, str) for name in names)
         require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
+        require(
+            WEIGHTS in names or not (folder / WEIGHTS).is_file(),
+            f"{folder} has weights twice: {WEIGHTS}, and {INDEX}, which names {listed(sorted(names), 3)} instead. "
+            "Which of them the checkpoint is cannot be told: remove the one that does not belong to it.",
+        )
         return [inside(folder, name, "weights") for name in sorted(names)]
     if (folder / WEIGHTS).is_file():
         return [inside(folder, WEIGHTS, "weights")]

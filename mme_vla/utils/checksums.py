@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -77,18 +77,28 @@ class Sums:
         self._compared |= set(paths)
 
 
-def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
+def check_sums(folder: Path, names: Collection[str] | None = None) -> bool:
     """Compare files with the sums that were written beside them.
 
     Args:
         folder: a folder that may hold `SHA256SUMS`.
-        names: the files about to be read; by default all that are listed. Files that are not listed are not checked:
-            people add notes and cards.
+        names: the files about to be read; by default all that are listed. Other files of the folder are not looked
+            at: people add notes and cards.
 
     Returns:
         Whether there were sums to compare with.
+
+    Raises:
+        UserError: a file about to be read is damaged, or it is not listed though there are sums.
     """
     sums = Sums(folder)
+    added = [] if names is None or not sums.there else [name for name in names if name not in sums.table]
+    for name in added:
+        require(
+            not (folder / name).exists(),
+            f"{folder / name} would be read, but {folder / SUMS} does not list it: it was added after the folder was "
+            f"written. Remove it, or copy the whole folder again; if you added it on purpose, delete {SUMS}.",
+        )
     sums.check(*(sorted(sums.table) if names is None else names))
     return sums.there
 

@@ -151,7 +151,7 @@ def test_a_video_that_comes_before_its_goal_is_read_with_the_goal(policy: Memory
     apart.goal = "press the button"
     assert apart.banks.count == 2
     torch.testing.assert_close(apart.banks.cognition.entries, together.banks.cognition.entries)
-    other = policy.start_episode("")
+    other = policy.start_episode("lift the cube")
     other.add_frames(video[policy.embodiment.memory_camera], is_demo=True)
     assert not torch.equal(other.banks.cognition.entries, apart.banks.cognition.entries)
 
