@@ -3,7 +3,9 @@
 from collections import Counter
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+
 from mme_vla.evaluation.records import EpisodeRecord
+
 
 @dataclass(frozen=True)
 class Pairing[Key: Hashable]:

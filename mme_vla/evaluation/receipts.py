@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -208,13 +209,15 @@ def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], con
         if key in settings:
             expected[field] = settings[key]
         else:
-            found.not_compared.append(f"settings.{key}: the receipt does not name it, so no record is compared with it.")
+            found.not_compared.append(
+                f"settings.{key}: the receipt does not name it, so no record is compared with it."
+            )
     subgoal = settings.get("subgoal")
     expected["subgoal"] = subgoal.get("name") if isinstance(subgoal, Mapping) else subgoal
     expected["event"] = settings.get("event")
     for field, value in expected.items():
         others = [record for record in records if str(getattr(record, field)) != str(value)]
-        _add_records(found, others, field, lambda record, field=field: getattr(record, field), value, "settings")
+        _add_records(found, others, field, attrgetter(field), value, "settings")
     if "training" in content:
         others = [r for r in records if (None if r.training is None else asdict(r.training)) != content["training"]]
         _add_records(found, others, "training", lambda record: record.training, content["training"], "receipt")
