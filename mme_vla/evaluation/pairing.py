@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+
 from mme_vla.evaluation.records import EpisodeRecord
 
 

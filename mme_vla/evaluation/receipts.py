@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -216,7 +217,7 @@ def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], con
     expected["event"] = settings.get("event")
     for field, value in expected.items():
         others = [record for record in records if str(getattr(record, field)) != str(value)]
-        _add_records(found, others, field, lambda record, field=field: getattr(record, field), value, "settings")
+        _add_records(found, others, field, attrgetter(field), value, "settings")
     if "training" in content:
         others = [r for r in records if (None if r.training is None else asdict(r.training)) != content["training"]]
         _add_records(found, others, "training", lambda record: record.training, content["training"], "receipt")

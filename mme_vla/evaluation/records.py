@@ -182,7 +182,8 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
             f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
             f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last.",
         )
-        if (conflicts == "last") == (new.when > old.when):
+        supersedes = new.when > old.when if conflicts == "last" else new.when < old.when
+        if supersedes:
             merged[at] = new
     return list(merged.values())
 

@@ -33,7 +33,7 @@ from mme_vla.utils.processes import files_to_hold
 __all__ = [
     "PLAN", "SUMS", "FolderLock", "Sums", "check_sums", "claim_plan", "decoding", "disk_trouble",
     "draft_of", "drop_plan", "file_sum", "files_to_hold", "inside", "is_alive", "is_draft", "is_text", "name_place",
-    "parse_json", "read_bytes", "read_json", "read_lines", "read_text", "read_unpacked", "remove_drafts", "require_file", "safe_name",
-    "sum_line", "to_json", "to_line", "user_cache", "verified", "with_checksum", "write_atomically",
-    "write_json", "write_sums",
+    "parse_json", "read_bytes", "read_json", "read_lines", "read_text", "read_unpacked", "remove_drafts",
+    "require_file", "safe_name", "sum_line", "to_json", "to_line", "user_cache", "verified", "with_checksum",
+    "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from helpers import REPOSITORY
 from helpers.probe_fakes import SIDE, MadeUpSource
-from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll, use_inline_envs
+from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, records, roll, use_inline_envs
 from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.receipts import verify
@@ -225,10 +225,13 @@ def test_a_card_without_another_scene_to_show_has_no_recovery(tmp_path: Path, mo
     monkeypatch.setattr(card_module, "lacking", lambda arm, *_, **__: "a camera" if arm.name == "distract:1" else None)
     monkeypatch.setattr(card_module, "run_probe", lambda policy, plan, *_, **__: plans.append(plan))
     monkeypatch.setattr(card_module, "evaluate", lambda *_, **__: None)
-    monkeypatch.setattr(card_module, "_outcomes", lambda *_: scenes([1, 1]))
+    ended = {EpisodeKey(record.task, record.episode): [record] for record in records("test", [1, 1])}
+    monkeypatch.setattr(card_module, "_scenes", lambda *_: ended)
     plan = ProbePlan(None, donors[:1], donors, JOBS[:2], OfflineSettings(1, 2))
     card = run_card(reader(TIME), plan, tmp_path, FACTS, RolloutSettings(), base=make_choice_env)
-    assert card.recovery is None and card.notes == ["wrong scene first (distract:1) was left out: it needs a camera."]
+    left_out, unnamed = card.notes
+    assert card.recovery is None and left_out == "wrong scene first (distract:1) was left out: it needs a camera."
+    assert "2 of 2 paired episodes have no digest of their scene" in unnamed
     assert all("distract:1" not in plan.arms for plan in plans)
 
 

@@ -447,8 +447,8 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             same = pair([{key: [record] for key, record in run.records.items()} for run in method.runs])
             if same.left_out:
                 notes.append(
-                    f"{method.label}: its runs are not known to be of the same scenes in {same.left_out} episodes, whose "
-                    "scenes differ or are named in some runs only; its mean is over all of them."
+                    f"{method.label}: its runs are not known to be of the same scenes in {same.left_out} episodes, "
+                    "whose scenes differ or are named in some runs only; its mean is over all of them."
                 )
     for split in sorted({run.key.split for method in methods for run in method.runs}):
         if is_other(split):

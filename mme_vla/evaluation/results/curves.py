@@ -66,7 +66,7 @@ def curves_of(
 ) -> Curves:
     """Success over every dial.
 
-    A point counts the episodes that the model has at every place of the dial, so that one curve is of the same episodes.
+    A point counts the episodes that the model has at every place of the dial: one curve is of the same episodes.
 
     records: merged. place: where a record lies; None for a record that lies on none, or at the zero. same_scenes:
         whether a dial leaves the scene as it is, so that only equal scenes are counted; one that changes the scene

@@ -94,8 +94,9 @@ def _method_text(results: Results) -> list[str]:
         f"Intervals ({100 * protocol.confidence:g} %): per task Wilson's, for the number of independent trials that "
         f"all runs are worth; elsewhere a bootstrap over episodes within tasks ({protocol.samples:,} samples, seed "
         f"{protocol.seed}). They describe other episodes of the same tasks, the deviation other seeds.",
-        "Comparisons pair the episodes: an exact sign test on the episodes that one method solves in more of its runs "
-        "than the other (McNemar's test where each has one run), corrected by Holm for the number of pairs.",
+        "Comparisons pair the episodes of the same scenes: an exact sign test on the episodes that one method solves "
+        "in more of its runs than the other (McNemar's test where each has one run), corrected by Holm for the number "
+        "of pairs.",
     ]
 
 
