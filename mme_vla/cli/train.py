@@ -160,7 +160,7 @@ def _train(
 
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.capabilities import with_vision_memory
-    from mme_vla.policy.finetune import apply_finetuning, cast_frozen, copy_tower
+    from mme_vla.policy.finetune import apply_finetuning, cast_frozen, copy_tower, warn_of_frozen_random_weights
     from mme_vla.policy.tensor_files import take_memory
     from mme_vla.policy.training_identity import KEY as TRAINING
     from mme_vla.policy.training_identity import identify
@@ -185,6 +185,8 @@ def _train(
     check_frozen(policy, config["finetune"]["freeze_vision"])
     if init_from is not None and holds:
         line.say(start_from(policy, init_from))
+    if first and init_from is None and run.checkpoint is None:
+        warn_of_frozen_random_weights(config["finetune"]["mode"])
     with nullcontext() if holds else torch.device("meta"):
         apply_finetuning(policy, **config["finetune"], seed=config["seed"])
     if run.checkpoint is not None:

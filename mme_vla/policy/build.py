@@ -16,7 +16,7 @@ from mme_vla.errors import UserError, require
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import CacheMemory, Memory, MemoryModule, past_view_spec
 from mme_vla.policy.base import Policy
-from mme_vla.policy.saving import policy_class
+from mme_vla.policy.saving import SECTIONS, policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.prompt import PROMPTS
@@ -92,12 +92,6 @@ def check_positions(config: Mapping[str, Any], integration: Integration, memory:
             f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
             "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
         )
-
-
-SECTIONS = (
-    "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
-    "token_budget",
-)  # fmt: skip
 
 
 def build_policy(

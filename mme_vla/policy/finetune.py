@@ -6,6 +6,7 @@ projector), `vlm` (token embedding and VLM expert), `action` (action expert, its
 """
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -106,7 +107,28 @@ def apply_finetuning(
     counts = dict.fromkeys(spec.components, 0)
     for name, parameter in policy.named_parameters():
         counts[spec.component_of(name)] += parameter.numel() if parameter.requires_grad else 0
+    require(
+        any(counts.values()),
+        f"finetune.mode={mode} with freeze_vision={freeze_vision} leaves no parameter of this policy to train; choose "
+        f"another of {', '.join(MODES)}.",
+    )
     return counts
+
+
+def warn_of_frozen_random_weights(mode: str) -> None:
+    """Warn that a mode that freezes most weights begins with random ones.
+
+    With `lora` nothing of the experts can learn then: the gates of fresh adaptive norms are zero and frozen, so that no
+    adapter behind them gets a gradient.
+    """
+    if mode == "full":
+        return
+    effect = "its adapters get no gradient behind gates that are zero, and" if mode == "lora" else "it"
+    warnings.warn(
+        f"finetune={mode} without init_from: weights that stay as they are are random, so {effect} can learn next to "
+        "nothing. Name weights to start from (init_from=…), or train everything (finetune=full).",
+        stacklevel=2,
+    )
 
 
 def copy_tower(source: "Policy", policy: "Policy") -> None:

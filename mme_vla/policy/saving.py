@@ -16,7 +16,7 @@ from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
 from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean, require
+from mme_vla.errors import UserError, brief, check_known, did_you_mean, require
 from mme_vla.policy.capabilities import ComparesSizes
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
@@ -167,6 +167,15 @@ def push_folder(
 CONFIG = "config.json"
 
 
+SECTIONS = (
+    "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
+    "token_budget",
+)  # fmt: skip
+"""Parts of a configuration that build a policy."""
+KNOWN_SECTIONS = (*SECTIONS, "adapters", TRAINING, "card")
+"""What `config.json` may hold: also adapters, the training that the policy came from, and texts for its card."""
+
+
 def read_config(folder: Path) -> dict[str, Any]:
     """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported."""
     path = inside(folder, CONFIG)
@@ -237,6 +246,8 @@ def load_policy[P: "Policy"](
         f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
         "are read by mme_vla.weights.load_weights() and converted by mme-vla weights.",
     )
+    for key in config:
+        check_known(f"section in {folder / CONFIG}:", key, KNOWN_SECTIONS)
     import_trusted(config, str(source), trust_plugins)
     policy_type = policy_class_for(requested, config, str(source))
     on_gpu = torch.device(device).type == "cuda"

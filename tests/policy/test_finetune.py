@@ -1,5 +1,6 @@
 """Which parameters learn, and adapters from birth to merge."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose, config_dir
-from mme_vla.policy.finetune import apply_finetuning, merge_adapters
+from mme_vla.policy.finetune import apply_finetuning, merge_adapters, warn_of_frozen_random_weights
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 from mme_vla.weights import load_weights
 
@@ -150,3 +151,22 @@ def test_each_config_file_is_what_the_function_takes(name: str) -> None:
     settings = compose("policy", [f"+finetune={name}"]).finetune
     assert settings.mode == name
     apply_finetuning(small_policy("framesamp_modul"), **settings)
+
+
+@pytest.mark.parametrize("mode", ["lora", "expert_only"])
+def test_freezing_random_weights_is_warned_of(mode: str) -> None:
+    with pytest.warns(UserWarning, match=f"finetune={mode} without init_from"):
+        warn_of_frozen_random_weights(mode)
+
+
+def test_training_everything_from_random_weights_is_not_warned_of(recwarn: pytest.WarningsRecorder) -> None:
+    warn_of_frozen_random_weights("full")
+    assert not recwarn.list
+
+
+def test_a_mode_that_leaves_nothing_to_train_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy = small_policy("pi05", backbone=FEW_TOKENS)
+    frozen = replace(policy.finetune_spec, frozen=".*")
+    monkeypatch.setattr(MMEPolicy, "finetune_spec", property(lambda self: frozen))
+    with pytest.raises(UserError, match="leaves no parameter"):
+        apply_finetuning(policy, "expert_only")
