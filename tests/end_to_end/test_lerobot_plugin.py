@@ -185,3 +185,15 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
     policy.reset()
     exact = policy.predict_action_chunk(batch, inference_delay=4, prev_chunk_left_over=left)
     assert torch.equal(bound, exact)
+
+
+def test_an_episode_that_ends_in_an_error_says_why(package: ModuleType) -> None:
+    class Failing:
+        def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+            info = {"status": "error", "error_message": "no way to this pose", "exception_type": "PlanningError"}
+            return {}, 0.0, True, False, info
+
+    env = package.env_mme_vla.RoboMMEWithVideo("StopCube", "test", 0, 10)
+    env._env = Failing()
+    *_, over, _, info = env.step(np.zeros(8))
+    assert over and (info["error_message"], info["exception_type"]) == ("no way to this pose", "PlanningError")

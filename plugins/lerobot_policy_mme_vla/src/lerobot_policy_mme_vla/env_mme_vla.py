@@ -78,7 +78,9 @@ class RoboMMEWithVideo(gym.Env):
             self._frame = _frames(lists)[-1]
         status = info["status"]
         over = bool(terminated) or status == "error"
-        return self._frame, 0.0, over, bool(truncated), {"is_success": status == "success", "status": status}
+        reasons = {key: str(info[key]) for key in ("error_message", "exception_type") if info.get(key)}
+        facts = {"is_success": status == "success", "status": status, **reasons}
+        return self._frame, 0.0, over, bool(truncated), facts
 
     def render(self) -> np.ndarray:
         """The front image that is shown."""
