@@ -25,7 +25,7 @@ def test_all_streams_of_a_file_are_read(padding: bytes, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rubbish", [b"rubbish", b"{}\n", lzma.compress(FIRST)[:20]])
 def test_what_follows_the_last_stream_is_refused(rubbish: bytes, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="episodes.jsonl.xz"):
+    with pytest.raises(UserError, match=r"episodes\.jsonl\.xz"):
         read_unpacked(packed(tmp_path, lzma.compress(FIRST) + rubbish))
 
 
