@@ -11,10 +11,11 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, brief, missing_extra, require
+from mme_vla.policy.tensor_files import check_transformers_folder
 from mme_vla.processing.base import PolicyProcessor, PromptSpec, read_settings
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import checked_text
-from mme_vla.utils import check_sums, inside
+from mme_vla.utils import checked_file
 
 HASHED = "hashed"
 """The encoder that makes fixed random vectors of words, to try things out without a download."""
@@ -70,6 +71,7 @@ class ClipEncoder(GoalEncoder):
             import transformers
         except ImportError:
             raise missing_extra(self.method, "baselines") from None
+        check_transformers_folder(self.source)
         try:
             tokenizer = transformers.CLIPTokenizer.from_pretrained(self.source)
             tower = getattr(transformers, self.tower).from_pretrained(self.source)
@@ -134,9 +136,7 @@ class GoalProcessor(PolicyProcessor):
             options: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
             if stats is not None:
                 require(isinstance(stats, str), f"stats={brief(stats)} must be the name of a file.")
-                path = inside(folder, stats, "statistics")
-                check_sums(folder, [stats])
-                options["stats"] = NormStats.load(path)
+                options["stats"] = NormStats.load(checked_file(folder, stats, "statistics"))
             return cls(**options, **settings)
         except (TypeError, ValueError, KeyError, IndexError) as error:
             raise UserError(f"{folder}: its processor cannot be built ({error}).") from None

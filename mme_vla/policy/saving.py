@@ -25,7 +25,7 @@ from mme_vla.policy.tensor_files import assign_tensors, dtype_of, list_weight_fi
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import weights_digest
 from mme_vla.registry import POLICIES
-from mme_vla.utils import check_sums, inside, read_json, write_sums
+from mme_vla.utils import checked_file, read_json, write_sums
 
 if TYPE_CHECKING:
     from mme_vla.policy.base import Policy
@@ -178,9 +178,7 @@ KNOWN_SECTIONS = (*SECTIONS, "adapters", TRAINING, "card")
 
 def read_config(folder: Path) -> dict[str, Any]:
     """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported."""
-    path = inside(folder, CONFIG)
-    check_sums(folder, [CONFIG])
-    config: dict[str, Any] = read_json(path, "a policy's configuration", limit=2**20)
+    config: dict[str, Any] = read_json(checked_file(folder, CONFIG), "a policy's configuration", limit=2**20)
     return config
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, check_choice, listed, require
-from mme_vla.utils import check_sums, inside, read_json
+from mme_vla.utils import check_sums, checked_file, inside, read_json
 
 WEIGHTS = "model.safetensors"
 INDEX = "model.safetensors.index.json"
@@ -37,7 +37,7 @@ def load_tensors(folder: Path) -> dict[str, Tensor]:
 
 
 def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
-    """Read safetensors files of a folder as one table, each compared with its checksum where there is one."""
+    """Read safetensors files of a folder as one table. Where it has checksums, they must list and fit each file."""
     files = list(files)
     check_sums(folder, [file.relative_to(folder).as_posix() for file in files])
     tensors: dict[str, Tensor] = {}
@@ -53,11 +53,11 @@ def weight_files(folder: Path) -> list[Path]:
     """The safetensors files that hold a folder's weights.
 
     Raises:
-        UserError: there are none, an index names no files, or there is a single file beside an index of other files.
+        UserError: there are none, there are two sets of them, or the index is none or not what was written.
     """
+    require_one_set(folder)
     if (folder / INDEX).is_file():
-        check_sums(folder, [INDEX])
-        table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
+        table = read_json(checked_file(folder, INDEX), "an index of safetensors files").get("weight_map")
         names = set(table.values()) if isinstance(table, dict) else set()
         texts = names and all(isinstance(name, str) for name in names)
         require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
@@ -72,9 +72,39 @@ def weight_files(folder: Path) -> list[Path]:
     raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
 
 
+def require_one_set(folder: Path) -> None:
+    """Refuse a folder that holds weights in one file and an index of others: nobody can know which are meant."""
+    if (folder / WEIGHTS).is_file() and (folder / INDEX).is_file():
+        raise UserError(
+            f"{folder} holds both {WEIGHTS} and {INDEX}, which names other files: it is not clear which are its "
+            "weights. Remove the one that does not belong to it, such as the rest of an earlier download."
+        )
+
+
 def list_weight_files(folder: Path) -> list[str]:
-    """The names of a folder's weights and of their index."""
-    return [*(INDEX for _ in folder.glob(INDEX)), *(file.name for file in weight_files(folder))]
+    """The names, relative to a folder, of the files that are read as its weights: an index, if there is one, first."""
+    files = [file.relative_to(folder).as_posix() for file in weight_files(folder)]
+    return [INDEX, *files] if (folder / INDEX).is_file() else files
+
+
+_TRANSFORMERS = (
+    "*.json", "*.jinja", "*.model", "merges.txt", "vocab.txt", "*.safetensors", "pytorch_model*.bin",
+    "adapter_model.bin",
+)  # fmt: skip
+
+
+def check_transformers_folder(source: str | Path) -> None:
+    """Check a folder before transformers or PEFT read it; a name on the hub is none.
+
+    Which of its files they read is theirs to decide: where there is a `SHA256SUMS`, it must list all that they may.
+
+    Raises:
+        UserError: a file is damaged, missing or not listed, or the folder holds two sets of weights.
+    """
+    folder = Path(source)
+    if folder.is_dir():
+        require_one_set(folder)
+        check_sums(folder, sorted({file.name for pattern in _TRANSFORMERS for file in folder.glob(pattern)}))
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ from mme_vla.processing.images import stack_past
 from mme_vla.processing.normalise import NormStats, normalize
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch, Labels
-from mme_vla.utils import check_sums, inside, read_json
+from mme_vla.utils import checked_file, read_json
 
 CONFIG_FILE = "processor.json"
 STATS_FILE = "norm_stats.json"
@@ -260,8 +260,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     require(
         (folder / CONFIG_FILE).is_file(), f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library."
     )
-    check_sums(folder, [CONFIG_FILE])
-    settings: dict[str, Any] = read_json(inside(folder, CONFIG_FILE), "a processor's settings", limit=2**20)
+    settings: dict[str, Any] = read_json(checked_file(folder, CONFIG_FILE), "a processor's settings", limit=2**20)
     return settings
 
 

@@ -38,7 +38,7 @@ from mme_vla.processing.prompt import (
 from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch
-from mme_vla.utils import check_sums, inside
+from mme_vla.utils import Sums, checked_file, inside
 
 TOKENIZER_FILE = "tokenizer.model"
 OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]  # what processors named before robots could be chosen: front and wrist
@@ -89,11 +89,9 @@ def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]
 
 
 def saved_file(folder: Path, name: Any, what: str) -> Path:
-    """The path of a file that a checkpoint names in itself, compared with its checksum where there is one."""
+    """The path of a file that a checkpoint names in itself; where the folder has checksums, it must have one."""
     require(isinstance(name, str), f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
-    path = inside(folder, name, what)
-    check_sums(folder, [name])
-    return path
+    return checked_file(folder, name, what)
 
 
 def saved_tokenizer(folder: Path, name: Any) -> str | Path:
@@ -102,7 +100,8 @@ def saved_tokenizer(folder: Path, name: Any) -> str | Path:
         return str(name)
     if isinstance(name, str) and name.startswith(HUB):
         if (folder / TOKENIZER_FILE).is_file():
-            return saved_file(folder, TOKENIZER_FILE, "tokenizer")
+            Sums(folder).check(TOKENIZER_FILE)  # it may be added later: its fingerprint is in processor.json
+            return inside(folder, TOKENIZER_FILE, "tokenizer")
         raise UserError(
             f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not fetched on a "
             f"checkpoint's word. If you trust it: from_pretrained(…, tokenizer={brief(name, 200)}), or download that "

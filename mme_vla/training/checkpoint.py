@@ -48,7 +48,7 @@ from mme_vla.training.shards import (
     shard_files,
     training_tensors,
 )
-from mme_vla.utils import check_sums, inside, read_json, write_sums
+from mme_vla.utils import checked_file, inside, read_json, write_sums
 
 FORMAT = "mme_vla training checkpoint 1"
 RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"
@@ -185,8 +185,7 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
         f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
         f"To start a new run from its weights use init_from={checkpoint}.",
     )
-    check_sums(checkpoint, [STATE])
-    state: dict[str, Any] = read_json(inside(checkpoint, STATE), "a training state", limit=2**24)
+    state: dict[str, Any] = read_json(checked_file(checkpoint, STATE), "a training state", limit=2**24)
     if state.get("format") != FORMAT:
         raise UserError(f"{path} was not written by this library's training (format {FORMAT!r} expected).")
     step = state.get("step")

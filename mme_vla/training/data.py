@@ -19,7 +19,7 @@ from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
 from mme_vla.types import labels_read
-from mme_vla.utils import check_sums, inside
+from mme_vla.utils import checked_file
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,7 @@ def prepare_data(
     split = split_episodes(sources, data["val_fraction"], val_episodes)
     processor, offset = policy.require_processor(), data["action_offset"]
     if stats_from is not None:
-        check_sums(stats_from, [STATS_FILE])
-        processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
+        processor.stats = NormStats.load(checked_file(stats_from, STATS_FILE))
     else:
         counted, horizon = processor.stats_spec, processor.embodiment.action.horizon
         narrow = data.get("narrow_ranges") or "refuse"

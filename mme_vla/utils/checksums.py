@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from mme_vla.errors import UserError, require
+from mme_vla.errors import UserError, listed, require
 from mme_vla.utils.io import inside, read_text, write_atomically
 
 SUMS = "SHA256SUMS"
@@ -33,10 +33,10 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
     files stay.
     """
     files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    listed = sorted(set(names) if names is not None else {name for name in files if name != SUMS})
+    chosen = sorted(set(names) if names is not None else {name for name in files if name != SUMS})
     table = _read_sums(folder / SUMS) if keep and (folder / SUMS).exists() else {}
     with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-        table |= zip(listed, pool.map(lambda name: file_sum(folder / name), listed), strict=True)
+        table |= zip(chosen, pool.map(lambda name: file_sum(folder / name), chosen), strict=True)
     with write_atomically(folder / SUMS) as draft:
         draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 
@@ -60,7 +60,10 @@ class Sums:
         self._compared: set[str] = set()
 
     def check(self, *names: str) -> None:
-        """Compare these files, each the first time it is asked about; one that is not listed is not checked."""
+        """Compare these files, each the first time it is asked about; one that is not listed is not checked.
+
+        Datasets have such files: rows of the user's own, results of other programs. Of checkpoints, `check_sums` asks.
+        """
         paths = {name: inside(self.folder, name) for name in names if name in self.table and name not in self._compared}
         for path in paths.values():
             require(
@@ -82,25 +85,42 @@ def check_sums(folder: Path, names: Collection[str] | None = None) -> bool:
 
     Args:
         folder: a folder that may hold `SHA256SUMS`.
-        names: the files about to be read; by default all that are listed. Other files of the folder are not looked
-            at: people add notes and cards.
+        names: the files about to be read, each of which must be listed where there is a list; by default all that are
+            listed. Notes and cards that people add are not read, and need no line.
 
     Returns:
         Whether there were sums to compare with.
 
     Raises:
-        UserError: a file about to be read is damaged, or it is not listed though there are sums.
+        UserError: a file is damaged, missing, or not listed: it was added after the sums were written.
     """
     sums = Sums(folder)
-    added = [] if names is None or not sums.there else [name for name in names if name not in sums.table]
-    for name in added:
-        require(
-            not (folder / name).exists(),
-            f"{folder / name} would be read, but {folder / SUMS} does not list it: it was added after the folder was "
-            f"written. Remove it, or copy the whole folder again; if you added it on purpose, delete {SUMS}.",
+    if names is None:
+        sums.check(*sorted(sums.table))
+        return sums.there
+    names = list(names)
+    added = [name for name in names if sums.there and name not in sums.table]
+    if added:
+        raise UserError(
+            f"{folder / SUMS} does not list {listed(added)}, which would be read: added after the sums were written. "
+            f"Remove what does not belong to {folder}. If it does, add its line: sha256sum <file> >> {SUMS}"
         )
-    sums.check(*(sorted(sums.table) if names is None else names))
+    sums.check(*names)
     return sums.there
+
+
+def checked_file(folder: Path, name: str, what: str = "file") -> Path:
+    """The path of a file of a checkpoint that is about to be read: it lies in the folder, and its sum is right.
+
+    Args:
+        folder: a folder that may hold `SHA256SUMS`. name: relative to it. what: the file is, for the message.
+
+    Raises:
+        UserError: it lies outside, is damaged, or is not listed; see `check_sums`.
+    """
+    path = inside(folder, name, what)
+    check_sums(folder, [name])
+    return path
 
 
 def _read_sums(sums: Path) -> dict[str, str]:
@@ -108,7 +128,7 @@ def _read_sums(sums: Path) -> dict[str, str]:
     for number, line in enumerate(read_text(sums, "a list of checksums").split("\n"), start=1):
         match = _LINE.fullmatch(line)
         if match is not None:
-            table[match[2]] = match[1]
+            table[match[2].removeprefix("./")] = match[1]  # as `sha256sum ./*` writes it
         elif line:
             raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
     return table

@@ -14,8 +14,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.saving import recompute_buffers
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
-from mme_vla.processing.processor import CONFIG_FILE
-from mme_vla.utils import inside, read_json
+from mme_vla.processing.base import CONFIG_FILE, read_settings
 from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
 from mme_vla.weights.source import METHOD_FORMATS, Source, open_source
@@ -175,7 +174,7 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     file = folder / CONFIG_FILE
     if policy.processor is None or not file.is_file():
         return
-    source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
+    source_fingerprint = read_settings(folder).get("tokenizer_fingerprint")
     processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
     require(
         source_fingerprint is None or target_fingerprint is None or source_fingerprint == target_fingerprint,

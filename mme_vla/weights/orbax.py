@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, missing_extra, require
-from mme_vla.utils import decoding, inside, read_text, require_file, safe_name
+from mme_vla.utils import checked_file, decoding, inside, read_text, require_file, safe_name
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
@@ -67,7 +67,7 @@ def variant_of(folders: Sequence[Path]) -> str | None:
     for folder in folders:
         note = folder / VARIANT_FILE
         if note.is_file():
-            text = read_text(inside(folder, note.name), "the name of a variant", limit=4096)
+            text = read_text(checked_file(folder, note.name), "the name of a variant", limit=4096)
             return Path(text.strip()).name.removesuffix(".yaml")
     return None
 

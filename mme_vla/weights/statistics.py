@@ -10,7 +10,7 @@ from torch import Tensor
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalise import NormStats, QuantileStats
-from mme_vla.utils import check_sums, inside, read_json
+from mme_vla.utils import checked_file, read_json
 from mme_vla.weights.source import METHOD_FORMATS
 
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -60,16 +60,14 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
             raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
         for file in (step["state_file"] for step in steps if step.get("state_file")):
             require(isinstance(file, str), f"{folder / name}: state_file={brief(file)} must be the name of a file.")
-            tensors = read_safetensors(inside(folder, file, "statistics"))
+            tensors = read_safetensors(checked_file(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
                 yield NormStats(**{target: _quantiles(tensors, source) for target, source in _FEATURES.items()})
 
 
 def _local_file(folder: Path, file: Path) -> Path:
     """A file of a checkpoint, which must lie in it, compared with its checksum where there is one."""
-    name = file.relative_to(folder).as_posix()
-    check_sums(folder, [name])
-    return inside(folder, name, "statistics")
+    return checked_file(folder, file.relative_to(folder).as_posix(), "statistics")
 
 
 def _quantiles(tensors: Mapping[str, Tensor], feature: str) -> QuantileStats:

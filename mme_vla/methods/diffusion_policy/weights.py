@@ -16,7 +16,7 @@ from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalise import NormStats
-from mme_vla.utils import inside, read_json
+from mme_vla.utils import checked_file, read_json
 from mme_vla.weights.tables import Adapter, Derived, Piece
 
 STATS = "stats.json"
@@ -69,7 +69,7 @@ def read_diffusion_stats(folder: Path) -> NormStats | None:
     """The statistics of `stats.json`, where there is one: the authors write `action` where others write `actions`."""
     if not (folder / STATS).is_file():
         return None
-    data = read_json(inside(folder, STATS, "statistics"), "normalisation statistics", limit=2**24)
+    data = read_json(checked_file(folder, STATS, "statistics"), "normalisation statistics", limit=2**24)
     inner = data.get("norm_stats")
     if isinstance(inner, dict) and "action" in inner and "actions" not in inner:
         data = {"norm_stats": {**inner, "actions": inner["action"]}}

@@ -17,7 +17,7 @@ from mme_vla.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import WEIGHTS, cast, read_files
 from mme_vla.processing.normalise import NormStats, QuantileStats
-from mme_vla.utils import inside, read_json
+from mme_vla.utils import check_sums, checked_file, read_json
 from mme_vla.weights.tables import Adapter, Piece
 from mme_vla.weights.torch_files import read_torch_file
 
@@ -79,6 +79,7 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     )
     if other := [name for name in ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern") if settings.get(name)]:
         raise UserError(f"{folder / FOLDER / SETTINGS} sets {listed(other)}, which are not read: merge it with peft.")
+    check_sums(folder, [f"{FOLDER}/{FILE}"])
     adapters = read_files(folder / FOLDER, (file,))
     downs = [name for name in adapters if name.startswith(_BEFORE) and name.endswith(_DOWN)]
     odd = sorted(set(adapters) - set(downs) - {name.removesuffix(_DOWN) + _UP for name in downs})
@@ -102,7 +103,7 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
 
 
 def _settings(folder: Path) -> dict[str, Any]:
-    place = inside(folder / FOLDER, SETTINGS, "adapters")
+    place = checked_file(folder, f"{FOLDER}/{SETTINGS}", "adapters")
     settings: dict[str, Any] = read_json(place, "a LoRA's settings", limit=2**20)
     return settings
 
@@ -150,7 +151,7 @@ def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
     for module in (HEAD, STATE):
         files = sorted(folder.glob(f"{module.rstrip('/')}--*_checkpoint.pt"), key=_step)
         if files:
-            heads = read_torch_file(files[-1])
+            heads = read_torch_file(checked_file(folder, files[-1].name, "weights"))
             merged |= {f"{module}{name.removeprefix(_WRAPPED)}": tensor for name, tensor in heads.items()}
     return merged
 
@@ -164,7 +165,7 @@ def read_dataset_statistics(folder: Path) -> NormStats | None:
     """The statistics of `dataset_statistics.json`, where it is of one dataset that has states."""
     if not (folder / STATISTICS).is_file():
         return None
-    data = read_json(inside(folder, STATISTICS, "statistics"), "normalisation statistics", limit=2**24)
+    data = read_json(checked_file(folder, STATISTICS, "statistics"), "normalisation statistics", limit=2**24)
     of = next(iter(data.values())) if len(data) == 1 else None
     if not isinstance(of, dict) or not all(isinstance(of.get(source_name), dict) for source_name in _FEATURES.values()):
         return None

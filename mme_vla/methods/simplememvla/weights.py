@@ -22,7 +22,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG
 from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.normalise import NormStats, QuantileStats
-from mme_vla.utils import check_sums, inside, read_json
+from mme_vla.utils import checked_file, read_json
 from mme_vla.weights.tables import Adapter, Piece
 
 STATS = "stats.json"
@@ -123,7 +123,7 @@ def _check_config(config: Mapping[str, Any]) -> None:
 def configured(cfg: DictConfig, config: Mapping[str, Any], folder: Path) -> DictConfig:
     """A composed configuration as a published checkpoint says: sizes, window, robot's words, rates, its tokenizer."""
     if (folder / TOKENIZER_FILE).is_file():
-        cfg.processor.tokenizer = str(inside(folder, TOKENIZER_FILE, "tokenizer"))
+        cfg.processor.tokenizer = str(checked_file(folder, TOKENIZER_FILE, "tokenizer"))
     if not config or "backbone_config" not in config:
         return cfg
     with open_dict(cfg):
@@ -202,8 +202,7 @@ def read_published_stats(folder: Path) -> NormStats | None:
     """
     if not (folder / STATS).is_file():
         return None
-    check_sums(folder, [STATS])
-    data = read_json(inside(folder, STATS, "statistics"), "normalisation statistics", limit=2**24)
+    data = read_json(checked_file(folder, STATS, "statistics"), "normalisation statistics", limit=2**24)
     features = {"state": data.get("observation.state"), "actions": data.get("action")}
     if not all(isinstance(feature, dict) for feature in features.values()):
         return None

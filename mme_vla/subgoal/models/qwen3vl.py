@@ -10,6 +10,7 @@ import torch
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean, missing_extra, require
+from mme_vla.policy.tensor_files import check_transformers_folder
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.tiny import make_tiny
 from mme_vla.subgoal.text import IMAGE, VIDEO, split_media
@@ -91,6 +92,7 @@ class VLM:
         if adapter is not None:
             from peft import PeftModel
 
+            check_transformers_folder(adapter)
             try:
                 model = PeftModel.from_pretrained(model, adapter).merge_and_unload()
             except (OSError, ValueError) as error:
@@ -152,6 +154,7 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
         raise missing_extra("Qwen3-VL", "vlm") from None
     if name == TINY:
         return make_tiny()
+    check_transformers_folder(name)
     try:
         processor = AutoProcessor.from_pretrained(name)
         return Qwen3VLForConditionalGeneration.from_pretrained(name, dtype=getattr(torch, dtype)), processor
