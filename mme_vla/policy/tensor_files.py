@@ -55,30 +55,29 @@ def weight_files(folder: Path) -> list[Path]:
     Raises:
         UserError: there are none, there are two sets of them, or the index is none or not what was written.
     """
-    require_one_set(folder)
     if (folder / INDEX).is_file():
-        table = read_json(checked_file(folder, INDEX), "an index of safetensors files").get("weight_map")
-        names = set(table.values()) if isinstance(table, dict) else set()
-        texts = names and all(isinstance(name, str) for name in names)
-        require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
-        require(
-            WEIGHTS in names or not (folder / WEIGHTS).is_file(),
-            f"{folder} has weights twice: {WEIGHTS}, and {INDEX}, which names {listed(sorted(names), 3)} instead. "
-            "Which of them the checkpoint is cannot be told: remove the one that does not belong to it.",
-        )
-        return [inside(folder, name, "weights") for name in sorted(names)]
+        return [inside(folder, name, "weights") for name in require_one_set(folder)]
     if (folder / WEIGHTS).is_file():
         return [inside(folder, WEIGHTS, "weights")]
     raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
 
 
-def require_one_set(folder: Path) -> None:
-    """Refuse a folder that holds weights in one file and an index of others: nobody can know which are meant."""
-    if (folder / WEIGHTS).is_file() and (folder / INDEX).is_file():
-        raise UserError(
-            f"{folder} holds both {WEIGHTS} and {INDEX}, which names other files: it is not clear which are its "
-            "weights. Remove the one that does not belong to it, such as the rest of an earlier download."
-        )
+def require_one_set(folder: Path) -> list[str]:
+    """The files that a folder's index names, once nothing else in it could be meant as its weights.
+
+    Raises:
+        UserError: the index is none, or there is a single file of weights beside it that it does not name.
+    """
+    table = read_json(checked_file(folder, INDEX), "an index of safetensors files").get("weight_map")
+    names = set(table.values()) if isinstance(table, dict) else set()
+    texts = names and all(isinstance(name, str) for name in names)
+    require(texts, f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
+    require(
+        WEIGHTS in names or not (folder / WEIGHTS).is_file(),
+        f"{folder} holds both {WEIGHTS} and {INDEX}, which names other files: it is not clear which are its "
+        "weights. Remove the one that does not belong to it, such as the rest of an earlier download.",
+    )
+    return sorted(names)
 
 
 def list_weight_files(folder: Path) -> list[str]:
@@ -103,7 +102,8 @@ def check_transformers_folder(source: str | Path) -> None:
     """
     folder = Path(source)
     if folder.is_dir():
-        require_one_set(folder)
+        if (folder / INDEX).is_file():
+            require_one_set(folder)
         check_sums(folder, sorted({file.name for pattern in _TRANSFORMERS for file in folder.glob(pattern)}))
 
 

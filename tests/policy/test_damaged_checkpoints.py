@@ -164,44 +164,6 @@ def test_moments_that_are_no_numbers_are_refused(checkpoint: Path) -> None:
     assert name in refusal(resume, checkpoint)
 
 
-def saved_apart(folder: Path) -> None:
-    """Put a second set of weights, all halved, beside a checkpoint's, with an index that names it."""
-    tensors = {name: tensor / 2 for name, tensor in load_file(folder / "model.safetensors").items()}
-    save_file(tensors, folder / "other.safetensors")
-    table = {"metadata": {}, "weight_map": dict.fromkeys(tensors, "other.safetensors")}
-    (folder / "model.safetensors.index.json").write_text(json.dumps(table))
-
-
-READERS: dict[str, Callable[[Path], Any]] = {
-    "from_pretrained": MMEPolicy.from_pretrained,
-    "weights to start from": lambda folder: start_from(tiny(), str(folder)),
-    "weights of any format": lambda folder: load_weights(tiny(), folder),
-}
-
-
-@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
-@pytest.mark.parametrize("sums", [True, False], ids=["with sums", "without sums"])
-def test_weights_added_to_a_checkpoint_do_not_replace_its_own(read: Any, sums: bool, checkpoint: Path) -> None:
-    saved_apart(checkpoint)
-    if not sums:
-        (checkpoint / SUMS).unlink()
-    message = refusal(read, checkpoint)
-    assert "model.safetensors.index.json" in message and (SUMS if sums else "twice") in message
-
-
-@pytest.mark.parametrize("name", ["config.json", "processor.json", "model.safetensors"])
-def test_a_file_that_is_read_must_be_listed_where_there_are_sums(name: str, checkpoint: Path) -> None:
-    lines = (checkpoint / SUMS).read_text().splitlines(keepends=True)
-    (checkpoint / SUMS).write_text("".join(line for line in lines if not line.endswith(f"  {name}\n")))
-    message = refusal(MMEPolicy.from_pretrained, checkpoint)
-    assert name in message and "does not list it" in message
-
-
-def test_notes_beside_a_checkpoint_are_not_read_and_may_be_added(checkpoint: Path) -> None:
-    (checkpoint / "notes.txt").write_text("the run of Monday")
-    MMEPolicy.from_pretrained(checkpoint)
-
-
 @pytest.mark.parametrize("key", ["memroy", "extra", "Backbone"])
 def test_an_unknown_section_of_a_configuration_is_refused_with_the_known_ones(key: str, checkpoint: Path) -> None:
     config = json.loads((checkpoint / "config.json").read_text())
