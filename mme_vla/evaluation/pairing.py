@@ -28,6 +28,16 @@ class Pairing[Key: Hashable]:
 
     def notes(self, what: str) -> list[str]:
         """What a reader has to know, one sentence each. what: which runs are compared."""
+        lines = self.gaps(what)
+        if self.unnamed:
+            lines.append(
+                f"{what}: {self.unnamed} of {len(self.keys)} paired episodes have no digest of their scene on either "
+                "side: they are taken for the same by task, number and seed."
+            )
+        return lines
+
+    def gaps(self, what: str) -> list[str]:
+        """The notes on episodes that are not paired: all that matters where one command ran both sides."""
         lines = []
         if self.other:
             lines.append(
@@ -38,11 +48,6 @@ class Pairing[Key: Hashable]:
             lines.append(
                 f"{what}: {sum(self.mixed.values())} episodes are not paired, for only some of the runs name their "
                 f"scene ({_by_task(self.mixed)}): evaluate the others again with this version."
-            )
-        if self.unnamed:
-            lines.append(
-                f"{what}: {self.unnamed} of {len(self.keys)} paired episodes have no digest of their scene on either "
-                "side: they are taken for the same by task, number and seed."
             )
         return lines
 

@@ -164,8 +164,8 @@ def run_card(
     unprobed, equal = _scenes(folder / ONLINE / slug(UNPROBED.name), plan), _scenes(folder / AGAIN, plan)
     probed = {label: _scenes(folder / ONLINE / slug(arms[label].name), plan) for label in possible}
     same = pair([unprobed, equal, *probed.values()])
-    notes += same.notes("The arms")
-    require(same.keys or not same.left_out, " ".join(same.notes("The arms")))
+    notes += same.gaps("The arms")
+    require(same.keys or not same.left_out, " ".join(same.gaps("The arms")))
     shown = {}
     for name, records in others.items():
         beside = pair([unprobed, records])

@@ -120,7 +120,7 @@ def run_probe(
     records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
     comparisons = _paired(records, facts.split, facts.model)
     notes += idle_events(records)
-    notes += [note for comparison in comparisons for note in comparison.notes]
+    notes += [note for comparison in comparisons for note in comparison.gaps]
     write_images(findings, plan.recordings, folder)
     return Probe(findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes))
 

@@ -43,7 +43,7 @@ class Comparison:
     repeated, flipped: episodes that were run twice with the same weights and seed, and those of them that then ended
         otherwise; of both methods.
     paired: whether episodes are paired; if not, wins and losses are 0, and p is of the difference of two means.
-    notes: which episodes were not paired, and why; a sentence each.
+    notes: which episodes were not paired, and which have no digest of their scene; a sentence each. gaps: the former.
     """
 
     first: str
@@ -64,6 +64,7 @@ class Comparison:
     flipped: int = 0
     paired: bool = True
     notes: tuple[str, ...] = ()
+    gaps: tuple[str, ...] = ()
 
     @property
     def better_worse(self) -> str:
@@ -153,12 +154,12 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
                 100 * float(np.mean([gaps[task].mean() for task in inside])),
                 _interval({task: sampled[task] for task in inside}, protocol),
             )
-    return Comparison(
+    made = Comparison(
         first.label, second.label, len(common), len(protocol.averaged) * protocol.episodes, float(means[0]),
         float(means[1]), float(means[0] - means[1]), _interval(sampled, protocol), wins, losses, p, p,
         p < 1 - protocol.confidence, suites, first.repeated + second.repeated, first.flipped + second.flipped,
-        notes=tuple(pairing.notes(f"{first.label} − {second.label}")),
     )  # fmt: skip
+    return _noted(made, pairing)
 
 
 def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Comparison:
@@ -180,12 +181,17 @@ def compare_unpaired(first: Method, second: Method, protocol: Protocol) -> Compa
     if deviation > 0:
         p = math.erfc(abs(difference) / deviation / math.sqrt(2))
     half = NormalDist().inv_cdf(0.5 + protocol.confidence / 2) * deviation
-    return Comparison(
+    made = Comparison(
         first.label, second.label, min(len(side) for side in rates), len(protocol.averaged) * protocol.episodes,
         means[0], means[1], difference, Interval(difference - half, difference + half), 0, 0, p, p,
         p < 1 - protocol.confidence, {}, first.repeated + second.repeated, first.flipped + second.flipped, paired=False,
-        notes=tuple(pair_methods(first, second).notes(f"{first.label} − {second.label}")),
     )  # fmt: skip
+    return _noted(made, pair_methods(first, second))
+
+
+def _noted(comparison: Comparison, pairing: Pairing[EpisodeKey]) -> Comparison:
+    what = f"{comparison.first} − {comparison.second}"
+    return replace(comparison, notes=tuple(pairing.notes(what)), gaps=tuple(pairing.gaps(what)))
 
 
 def _rates(method: Method) -> dict[EpisodeKey, list[float]]:
