@@ -102,6 +102,7 @@ def test_another_tokenizer_is_not_a_start(bases: dict[str, Path], tmp_path: Path
     MMEPolicy.from_pretrained(bases["ours"]).save_pretrained(tmp_path)
     about = json.loads((tmp_path / "processor.json").read_text())
     (tmp_path / "processor.json").write_text(json.dumps({**about, "tokenizer_fingerprint": "another"}))
+    (tmp_path / "SHA256SUMS").unlink()
     with pytest.raises(UserError, match="another tokenizer"):
         start_from(build_policy("framesamp_modul"), tmp_path)
 
