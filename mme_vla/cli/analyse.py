@@ -23,7 +23,7 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.errors import UserError, check_choice, require
-from mme_vla.utils import safe_name
+from mme_vla.utils import require_replaceable, safe_name
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
@@ -129,9 +129,10 @@ def recurrence(args: argparse.Namespace) -> None:
                     for key, values in curves.curves.items():
                         log.number(f"recurrence/{key}", values[i])
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    table = _beside(path, ".csv")
+    require_replaceable(path, ".svg").parent.mkdir(parents=True, exist_ok=True)
     path.write_text(recurrence_plot(episode_curves, f"{name} on {source.name}"), encoding="utf-8")
-    with path.with_suffix(".csv").open("w", newline="") as file:
+    with table.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["episode", "frame", *episode_curves[0].curves])
         for curves in episode_curves:
@@ -143,7 +144,7 @@ def recurrence(args: argparse.Namespace) -> None:
         for key, values in c.curves.items()
     ]
     _print(f"{name} on {source.name}", ["episode", "", "first frame", "last frame", "mean"], rows)
-    print(f"wrote {path} and {path.with_suffix('.csv')}")
+    print(f"wrote {path} and {table}")
 
 
 def selection(args: argparse.Namespace) -> None:
@@ -164,9 +165,10 @@ def selection(args: argparse.Namespace) -> None:
                 log.views(source, args.episode, step)
                 log.log_image("remembered", sheet)
     path = args.output or Path("outputs/analyse") / f"{source.name}_episode{args.episode}_{args.memory}.mp4"
+    last = _beside(path, ".png")
     write_video(of_one_size(sheets), path, fps=args.fps)
-    sheets[-1].save(path.with_suffix(".png"))
-    print(f"wrote {path} ({len(sheets)} images) and {path.with_suffix('.png')}")
+    sheets[-1].save(last)
+    print(f"wrote {path} ({len(sheets)} images) and {last}")
 
 
 def cost(args: argparse.Namespace) -> None:
@@ -198,7 +200,7 @@ def cost(args: argparse.Namespace) -> None:
     columns = ["model", "prompt", "parameters", "forward pass", "sampled chunk", "memory", "streamed", "past frames"]
     _print("FLOPs", columns, rows)
     if args.output:
-        write_costs(costs, args.output)
+        write_costs(costs, require_replaceable(args.output, ".csv"))
         print(f"wrote {args.output}")
     return None
 
@@ -242,8 +244,9 @@ def writing(args: argparse.Namespace) -> None:
     table = writing_table(results)
     print(table)
     if args.output:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
-        args.output.with_suffix(".md").write_text(table, encoding="utf-8")
+        text = _beside(args.output, ".md")
+        text.parent.mkdir(parents=True, exist_ok=True)
+        text.write_text(table, encoding="utf-8")
     _save(args, {name: result.to_dict() for name, result in results.items()})
 
 
@@ -301,9 +304,19 @@ def _print(title: str, columns: Sequence[str], rows: list[list[str]]) -> None:
 
 def _save(args: argparse.Namespace, values: dict[str, Any]) -> None:
     if args.output:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
+        require_replaceable(args.output, ".json").parent.mkdir(parents=True, exist_ok=True)
         args.output.write_text(json.dumps(values, indent=1) + "\n")
         print(f"wrote {args.output}")
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """The second file of an output; one that is there without the first is somebody's, and not replaced."""
+    other = path.with_suffix(suffix)
+    require(
+        path.exists() or not other.exists(),
+        f"{other} exists, and would be written beside {path}: choose another --output, or remove it yourself.",
+    )
+    return other
 
 
 def _tera(flops: int) -> str:

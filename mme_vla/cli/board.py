@@ -14,6 +14,7 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import argument_parser
 from mme_vla.config.composition import compose, resolved
 from mme_vla.errors import printable, require
+from mme_vla.utils import require_replaceable
 
 SHIPPED = Path(__file__).resolve().parents[2] / "benchmarks" / "nano16"
 """The rows of the repository, a folder for each split."""
@@ -36,6 +37,8 @@ def main(words: Sequence[str], nano: Callable[[], None], with_settings: Callable
     parser.add_argument("--samples", type=int, help="of the bootstrap")
     with print_user_errors():
         args = parser.parse_intermixed_args(words)
+        if args.html:
+            require_replaceable(args.html, ".html", ".htm")
         words = [word for word in args.words if not word.startswith("rows=")]
         trees = [args.config_dir] if args.config_dir else []
         config = compose("nano", with_settings(words), extra_dirs=trees)

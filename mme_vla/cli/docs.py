@@ -2,22 +2,27 @@
 
 import argparse
 import logging
+import shutil
+import tempfile
 import webbrowser
+from itertools import islice
 from pathlib import Path
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, listed, missing_extra, require
+from mme_vla.utils import file_sum, read_json, write_json
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SETTINGS = REPOSITORY / "mkdocs.yml"
-MARK = ".mme-vla-site"
-"""A file in every site that the command built: what is there may be replaced."""
+FILES = ".mme-vla-site.json"
+"""Lies in a site, with the SHA-256 of each other file of it: what a later build may remove."""
 
 
 def build_site(output: Path) -> Path:
-    """Build the site into a folder, whose content is replaced, and return its start page.
+    """Build the site into a folder, in place of an earlier site, and return its start page.
 
     Raises:
-        UserError: the extra `docs` is missing, this is no clone, or a page has a warning (a broken link, for example).
+        UserError: the folder holds anything but an earlier site, the extra `docs` is missing, this is no clone, or a
+            page has a warning (a broken link, for example). Then the folder is as it was.
     """
     try:
         from mkdocs.commands.build import build
@@ -25,40 +30,78 @@ def build_site(output: Path) -> Path:
         from mkdocs.exceptions import Abort, MkDocsException
     except ImportError:
         raise missing_extra("The documentation site", "docs") from None
-    check_output(output)
-    if not SETTINGS.is_file():
-        raise UserError(f"The pages are in the repository, not in the installed package ({SETTINGS} is missing).")
-    try:
-        config = load_config(str(SETTINGS), strict=True, site_dir=str(output.resolve()))
-        output.mkdir(parents=True, exist_ok=True)
-        (output / MARK).touch()  # first: an interrupted site is replaced too; names with a dot survive the cleaning
-        config.plugins.on_startup(command="build", dirty=False)
-        build(config)
-        config.plugins.on_shutdown()
-    except (Abort, MkDocsException) as error:
-        raise UserError(f"The site was not built: {error}") from error
+    require(
+        SETTINGS.is_file(), f"The pages are in the repository, not in the installed package ({SETTINGS} is missing)."
+    )
+    target = output.resolve()
+    check_site(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".mme-vla-site-", dir=target.parent) as place:
+        draft = Path(place) / "site"
+        try:
+            config = load_config(str(SETTINGS), strict=True, site_dir=str(draft))
+            config.plugins.on_startup(command="build", dirty=False)
+            build(config)
+            config.plugins.on_shutdown()
+        except (Abort, MkDocsException) as error:
+            raise UserError(f"The site was not built: {error}") from error
+        files = [path for path in draft.rglob("*") if path.is_file()]
+        write_json(draft / FILES, {path.relative_to(draft).as_posix(): file_sum(path) for path in files})
+        check_site(target)  # building takes a while
+        _replace(draft, target)
     return output / "index.html"
 
 
-def check_output(output: Path) -> None:
-    """Make sure that a folder holds nothing that building a site there would delete.
+def check_site(folder: Path) -> None:
+    """Refuse a folder that holds anything but an earlier site, since building removes what is there.
 
     Raises:
-        UserError: it is a file, or holds anything but a site that this command built before.
+        UserError: files or folders in it are not of a site that was built here, or were changed since.
     """
-    if not output.exists() or (output / MARK).is_file():
-        return
-    if not output.is_dir() or any(output.iterdir()):
-        raise UserError(
-            f"--output {output} holds something else than a site of `mme-vla docs`, which building would delete. Name "
-            "a folder that is new, empty, or an earlier site."
-        )
+    require(not folder.exists() or folder.is_dir(), f"--output {folder} is a file: give a folder for the site.")
+    record = folder / FILES
+    sums = read_json(record, "the files of a site") if record.is_file() else {}
+    folders = {parent.as_posix() for name in sums for parent in Path(name).parents}
+    # Not all of them: the folder may be somebody's home.
+    foreign = list(islice((path for path in folder.rglob("*") if not _is_ours(path, folder, sums, folders)), 5))
+    require(
+        not foreign,
+        f"--output {folder} holds what is no site of this command, or was changed since, such as "
+        f"{listed(sorted(path.name for path in foreign))}. A new site replaces the whole folder: choose another, or "
+        "remove this one yourself.",
+    )
+
+
+def _is_ours(path: Path, folder: Path, sums: dict[str, str], folders: set[str]) -> bool:
+    name = path.relative_to(folder).as_posix()
+    if path.is_symlink():
+        return False
+    if path.is_dir():
+        return name in folders
+    return name == FILES or (name in sums and file_sum(path) == sums[name])
+
+
+def _replace(draft: Path, target: Path) -> None:
+    """Move a built site into the folder of an earlier one; at each moment its list names all that is there."""
+    target.mkdir(exist_ok=True)
+    for path in sorted(target.iterdir(), key=lambda path: path.name == FILES):
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    for path in sorted(draft.iterdir(), key=lambda path: path.name != FILES):
+        shutil.move(path, target / path.name)
 
 
 def main() -> None:
     """Run `mme-vla docs`."""
     parser = argparse.ArgumentParser(prog="mme-vla docs", description=str(__doc__).partition(": ")[2])
-    parser.add_argument("--output", type=Path, default=Path("outputs/site"), help="folder of the site (%(default)s)")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("outputs/site"),
+        help="folder of the site, new or with an earlier site, which is replaced (%(default)s)",
+    )
     parser.add_argument("--build", action="store_true", help="build only, open no browser")
     arguments = parser.parse_args()
     logging.getLogger("mkdocs").addHandler(logging.StreamHandler())  # its warnings, which are errors here

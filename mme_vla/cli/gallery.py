@@ -11,6 +11,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.errors import UserError, require
+from mme_vla.utils import read_text
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 from mme_vla.utils.pages import render
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from mme_vla.envs.task import Task
 
+MADE = "Made by `mme-vla gallery`."  # stands on each page
 COLUMNS = 4  # images a row
 EVERY = 8  # Steps between two images that are taken; which of them are shown is decided at the end
 
@@ -77,8 +79,13 @@ def run(cfg: "DictConfig") -> None:
 
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
     require(isinstance(cfg.tiles, int) and cfg.tiles >= 2, f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
-    require_simulator()
     folder = Path(cfg.output)
+    page = folder / "README.md"
+    require(
+        not page.exists() or MADE in read_text(page),
+        f"{page} exists, and is no gallery: it is not replaced. Choose another output, or remove it yourself.",
+    )
+    require_simulator()
     folder.mkdir(parents=True, exist_ok=True)
     entries = []
     with progress("show", len(specs), unit="tasks") as advance:
@@ -90,8 +97,8 @@ def run(cfg: "DictConfig") -> None:
             entries.append((spec.task, env.goals()[0], image_name))
             env.close()
             advance(1)
-    (folder / "README.md").write_text(render("gallery.md", entries=entries))
-    print(f"{folder / 'README.md'}: {len(entries)} tasks.")
+    page.write_text(render("gallery.md", entries=entries))
+    print(f"{page}: {len(entries)} tasks.")
 
 
 def demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:

@@ -34,6 +34,7 @@ from mme_vla.evaluation.results.tables import (
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.utils import require_replaceable
 from mme_vla.utils.pages import escape_markdown, render
 
 DEMO = (
@@ -89,6 +90,7 @@ def run(args: argparse.Namespace) -> None:
 
     if args.demo == bool(args.runs):
         raise UserError("Name files or folders of episode records, or --demo for synthetic ones (not both).")
+    _check_outputs(args)
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     protocol = Protocol(
         tuple(args.tasks or tasks_of(records)), args.episodes or _episodes(records, args.split), args.errors,
@@ -183,6 +185,18 @@ def show_tables(tables: Sequence[Table], figures: dict[str, str], caption: str, 
         sections = [*boxes, *(Section(table.title, tables=[table]) for table in tables)]
         texts[args.html] = html_page(args.title, sections, notes=notes)
     _write(texts)
+
+
+def _check_outputs(args: argparse.Namespace) -> None:
+    """Refuse to write over what is no earlier output, such as records, before anything is read."""
+    for path, suffixes in (
+        (args.csv, (".csv", ".txt")),
+        (args.latex, (".tex", ".txt")),
+        (args.markdown, (".md", ".txt")),
+        (args.html, (".html", ".htm")),
+    ):
+        if path is not None:
+            require_replaceable(path, *suffixes)
 
 
 def _write(texts: dict[Path, str]) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, require
 
 VOCAB_SIZE = 1024
 
@@ -62,6 +62,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "folder", nargs="?", type=Path, default=Path(), help="where to write tokenizer.model (default: here)"
     )
     path = parser.parse_args(arguments).folder / "tokenizer.model"
+    content = train_tokenizer(read_corpus())
+    require(
+        not path.exists() or path.read_bytes() == content,
+        f"{path} exists, and is another tokenizer, which a checkpoint or a training may need: choose another folder, "
+        "or remove it yourself.",
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(train_tokenizer(read_corpus()))
+    path.write_bytes(content)
     print(f"Wrote {path} ({VOCAB_SIZE} pieces).")

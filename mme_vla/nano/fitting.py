@@ -1,6 +1,5 @@
 """One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
 
-import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,12 +28,12 @@ from mme_vla.policy.finetune import apply_finetuning, copy_tower
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.training_identity import KEY as TRAINING
 from mme_vla.policy.training_identity import identify, identity_of
-from mme_vla.training.checkpoint import checkpoints_in, read_state
+from mme_vla.training.checkpoint import checkpoints_in, read_state, tidy
 from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.order import Validation
 from mme_vla.training.runs import CHECKPOINTS, METRICS, changed_settings, check_content, claim_run
-from mme_vla.training.settings import TrainSettings
+from mme_vla.training.settings import KeepRule, TrainSettings
 from mme_vla.utils import FolderLock, read_json, read_lines, write_json
 
 HELD_OUT = 10  # One demonstration in so many only measures the loss
@@ -137,6 +136,17 @@ def train_in_process(job: Training) -> Path:
     return train(job)
 
 
+def _remove_drafts(folder: Path) -> None:
+    """Remove what a training left that ended before its first checkpoint; other things in it are refused later."""
+    drafts = folder / CHECKPOINTS
+    if drafts.is_dir():
+        tidy(drafts, KeepRule())
+        if any(drafts.iterdir()):
+            return
+        drafts.rmdir()
+    (folder / METRICS).unlink(missing_ok=True)
+
+
 def train(job: Training) -> Path:
     """Train a policy, or continue with it; the last checkpoint."""
     from accelerate import Accelerator
@@ -149,8 +159,7 @@ def train(job: Training) -> Path:
     resume = str(folder) if checkpoints_in(folder / CHECKPOINTS) else None
     if resume is None:
         with FolderLock(folder, "training run"):  # it may have ended before its first checkpoint
-            (folder / METRICS).unlink(missing_ok=True)
-            shutil.rmtree(folder / CHECKPOINTS, ignore_errors=True)
+            _remove_drafts(folder)
     run, lock = claim_run(folder, True, resume, full_config)
     with ExitStack() as resources:
         resources.push(lock)  # it is held already

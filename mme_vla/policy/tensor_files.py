@@ -220,7 +220,7 @@ def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], s
 
 def replace_folder(built: Path, target: Path) -> None:
     """Put a finished folder in place of `target` in one rename, so that no reader sees half of it."""
-    old = target.with_name(target.name + ".old")
+    old = target.with_name(f".{target.name}.old")  # `<name>.old` may be a copy of the user's
     shutil.rmtree(old, ignore_errors=True)
     if target.exists():
         target.rename(old)

@@ -18,6 +18,7 @@ from mme_vla.utils.io import (
     read_unpacked,
     remove_drafts,
     require_file,
+    require_replaceable,
     safe_name,
     to_json,
     to_line,
@@ -34,6 +35,6 @@ __all__ = [
     "PLAN", "SUMS", "FolderLock", "Sums", "check_sums", "checked_file", "claim_plan", "decoding", "disk_trouble",
     "draft_of", "drop_plan", "file_sum", "files_to_hold", "inside", "is_alive", "is_draft", "is_text", "name_place",
     "parse_json", "read_bytes", "read_json", "read_lines", "read_text", "read_unpacked", "remove_drafts",
-    "require_file", "safe_name", "sum_line", "to_json", "to_line", "user_cache", "verified", "with_checksum",
-    "write_atomically", "write_json", "write_sums",
+    "require_file", "require_replaceable", "safe_name", "sum_line", "to_json", "to_line", "user_cache", "verified",
+    "with_checksum", "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip

@@ -147,6 +147,23 @@ def _blobs_of(root: Path) -> list[Path]:
     return []
 
 
+def require_replaceable(path: Path, *suffixes: str) -> Path:
+    """Return where a command is to write a file, if it destroys nothing but, perhaps, an earlier file of the kind.
+
+    Args:
+        suffixes: how names of such files end, such as `.html`.
+
+    Raises:
+        UserError: a file is there whose name ends otherwise.
+    """
+    require(
+        not path.is_file() or path.suffix.lower() in suffixes,
+        f"{path} exists, and its name does not end with {' or '.join(suffixes)}: it is not replaced. Choose another "
+        "name, or remove it yourself.",
+    )
+    return path
+
+
 _HUB_REPOSITORY = re.compile(r"(models|datasets|spaces)--")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 
