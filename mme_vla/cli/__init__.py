@@ -5,7 +5,8 @@ import sys
 from importlib import import_module
 
 from mme_vla.cli.errors import print_user_errors
-from mme_vla.errors import UserError
+from mme_vla.errors import require
+from mme_vla.utils.processes import started_processes
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train a policy"),
@@ -34,8 +35,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Name on the command line → module of this package, and a line of help."""
 
 
-SHARED = {"train", "evaluate", "cache", "subgoal_train"}
+SHARED = {"train", "evaluate", "probe", "cache", "subgoal_train"}
 """Modules of commands whose work several processes of a launcher share."""
+READING = {"results", "analyse", "inspect"}
+"""Modules of commands that print what exists, which any number of processes may do."""
 
 _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}  # Options that only print
 
@@ -49,7 +52,8 @@ def run(module: str) -> None:
     # step tenfold. It counts only when set before PyTorch is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with print_user_errors():
-        check_launcher(module)
+        if _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
+            check_launcher(module)
         first = os.environ.get("LOCAL_RANK", "0") == "0"
         if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
             print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
@@ -60,14 +64,15 @@ def check_launcher(module: str) -> None:
     """Refuse to start a command in several processes that would each do all of its work.
 
     Raises:
-        UserError: `torchrun` started this process beside others, and the command does not share its work.
+        UserError: a launcher started this process beside others, and the command does not share its work; or a
+            launcher was asked for several processes and started one.
     """
-    processes = os.environ.get("WORLD_SIZE", "1")
-    if module in SHARED or not processes.isdecimal() or int(processes) <= 1:
+    if module in SHARED | READING:
         return
-    name = next(name for name, (other, _) in COMMANDS.items() if other == module)
+    started = started_processes()
     sharing = ", ".join(name for name, (other, _) in COMMANDS.items() if other in SHARED)
-    raise UserError(
-        f"WORLD_SIZE={processes}: `{name}` does not share its work among processes, so each would do all of it. Start "
-        f"it without a launcher. Commands that share their work: {sharing}."
+    require(
+        started == 1,
+        f"{started} processes were started (WORLD_SIZE), and each would do all of this command's work: start it "
+        f"without a launcher. Commands that share their work: {sharing}.",
     )

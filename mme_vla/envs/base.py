@@ -277,6 +277,8 @@ class EpisodeEnv:
             "status": "success" if success and (terminated or truncated) else over,
             "simple_subgoal_online": str(info.get("subgoal", "")),
         }
+        if (terminated or truncated) and info.get("error_message"):
+            report |= {"status": "error", "error_message": str(info["error_message"])}
         if self._by_choice and report["status"] == "ongoing":
             choices, name = dict(self.environment.choices(self.env)), type(self.environment).__name__
             require(choices, f"{name} offers no choices to play: implement choices(env).")

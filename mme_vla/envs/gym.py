@@ -14,9 +14,9 @@ import numpy as np
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE, benchmark_state
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import load_tasks, make_env
-from mme_vla.envs.metadata import TASK_NAMES, episodes
-from mme_vla.errors import check_choice
-from mme_vla.registry import TASKS
+from mme_vla.envs.metadata import TASK_NAMES, episodes, step_limit
+from mme_vla.errors import check_choice, check_known, require
+from mme_vla.registry import REWARDS, TASKS
 
 _POSITION, _ANGLE = 2.0, 2 * np.pi  # bounds of a commanded pose: metres and radians
 _LOWEST, _HIGHEST = (-2.9, -1.8, -2.9, -3.1, -2.9, -0.02, -2.9), (2.9, 1.8, 2.9, 0.0, 2.9, 3.8, 2.9)
@@ -38,8 +38,12 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         action_space: `joint_angle`, `ee_pose` or `waypoint`.
         reward: `sparse`, `subtask` or `none`.
         images: whether frames are rendered; without, a step is about 80 times faster.
-        max_steps: as in `make_env`, where the benchmark ends an episode at the step after it; None: of the split.
+        max_steps: control steps until an episode is truncated, several of which an action by poses may take; None: as
+            many as the split allows. `make_env` and `evaluate` count as the benchmark does, one step more.
         render_mode: `rgb_array` with images, None without.
+
+    Raises:
+        UserError: a task, split, episode, action space, reward or `max_steps` that does not exist.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -56,10 +60,15 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         render_mode: str | None = None,
     ) -> None:
         check_choice("action_space", action_space, SPACES)
+        check_known("reward", reward, REWARDS)
+        limit = step_limit(split) if max_steps is None else max_steps
+        require(type(limit) is int and limit >= 1, f"max_steps is {limit!r}; expected a positive integer.")
         self.task, self.split, self.episode = task, split, episode
         self.images = images or render_mode is not None
         self.render_mode = render_mode
-        self._options: dict[str, Any] = {"action_space": action_space, "reward": reward, "max_steps": max_steps}
+        # The environment itself times out a step after its limit, as the benchmark does.
+        self._limit = limit
+        self._options: dict[str, Any] = {"action_space": action_space, "reward": reward, "max_steps": max(limit - 1, 1)}
         self._count = len(episodes(task, split))
         self._env: RoboMMEEnv | None = None
         self._number: int | None = None
@@ -98,6 +107,9 @@ class GymTask(gymnasium.Env[Any, np.ndarray]):
         frames, reward, terminated, truncated, info = self._env.step(np.asarray(action, np.float64))
         if frames:
             self._take(frames)
+        steps = self._env.steps_counted - 1  # one passes before the first action
+        if steps >= self._limit and not terminated:
+            truncated, info = True, {**info, "status": "timeout"}
         return self._copy(), float(reward), bool(terminated), bool(truncated), self._info(info)
 
     def render(self) -> np.ndarray | None:

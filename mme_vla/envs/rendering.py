@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import os
 import re
 import shutil
 import subprocess
@@ -29,9 +30,32 @@ INSTALL_HINT = (
 OLDEST_MESA = 24
 
 
-@cache
+_process: int | None = None
+"""The process in which the renderer began."""
+
+
 def render_backend() -> str:
-    """The simulator's name for the device that renders: the GPU if there is one, else the CPU."""
+    """The simulator's name for the device that renders: the GPU if there is one, else the CPU.
+
+    Raises:
+        UserError: this machine cannot render, or this process was forked from one in which the renderer had begun:
+            its threads are not in the copy, which would wait for them for ever.
+    """
+    global _process
+    if _process is None:
+        _process = os.getpid()
+    require(
+        _process == os.getpid(),
+        f"This process was forked from process {_process}, where images had been rendered: rendering would wait for "
+        'ever here. Start processes afresh (`spawn` or `forkserver`: AsyncVectorEnv(…, context="spawn"), '
+        'DataLoader(…, multiprocessing_context="spawn")), fork before the first image, or pass images=False or '
+        "render=False.",
+    )
+    return _find_backend()
+
+
+@cache
+def _find_backend() -> str:
     import sapien
 
     try:

@@ -207,21 +207,41 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
 
 
 def read_unpacked(path: Path, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
-    """Read a file of at most `limit` bytes, a file `*.xz` decompressed: all of its streams, and nothing else in it."""
+    """Read a file of at most `limit` bytes, a file `*.xz` unpacked: all of its streams, and nothing else in it."""
     data = read_bytes(path, what, limit)
-    if path.suffix != ".xz":
-        return data
-    parts, left, more = list[bytes](), limit, True
-    while more:
-        unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ)
-        with decoding(path, what, "Copy it again."):
-            parts.append(unpacker.decompress(data, left))
-        require(unpacker.eof, f"{path} is cut off, or has more than {limit:,} bytes of {what}. Copy it again.")
-        left -= len(parts[-1])
-        # Between streams the format allows null bytes, four at a time.
-        data = unpacker.unused_data.lstrip(b"\0")
-        more = bool(data)
-    return b"".join(parts)
+    return unpack_xz(data, path, what, limit) if path.suffix == ".xz" else data
+
+
+_BLOCK = 2**14  # bytes that a stream's unpacker is given at once: it copies those that it leaves over
+
+
+def unpack_xz(packed: bytes, source: Path | str, what: str = "data", limit: int = LOG_LIMIT) -> bytes:
+    """Unpack the content of an `.xz` file to its end: all its streams, as `xz -dc` does.
+
+    Args:
+        packed: the file's bytes. source: the file, for messages. what: it holds.
+        limit: bytes of the unpacked content, over all streams.
+
+    Raises:
+        UserError: it is cut off, damaged, larger than `limit`, or something else follows its last stream.
+    """
+    remedy = "Copy it again."
+    stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
+    pieces, size, position = list[bytes](), 0, 0
+    while not stream.eof or position < len(packed):
+        if stream.eof:
+            stream = lzma.LZMADecompressor(lzma.FORMAT_XZ)
+        block = packed[position : position + _BLOCK]  # what lies behind a stream is copied once a stream
+        require(block, f"{source} is cut off: its last stream has no end. {remedy}")
+        with decoding(source, what, remedy):
+            piece = stream.decompress(block, limit + 1 - size)  # one more byte shows that there is more
+        size += len(piece)
+        require(size <= limit, f"{source} has more than {limit:,} bytes of {what}, unpacked; that is the limit.")
+        pieces.append(piece)
+        position += len(block) - len(stream.unused_data)
+        while stream.eof and packed[position : position + 4] == bytes(4):  # padding between streams, by the format
+            position += 4
+    return b"".join(pieces)
 
 
 def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:

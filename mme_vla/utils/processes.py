@@ -5,9 +5,11 @@ import os
 import resource
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from multiprocessing.connection import wait
+
+from mme_vla.errors import brief, require
 
 
 def end_with_parent() -> None:
@@ -56,3 +58,31 @@ def files_to_hold(limit: int) -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, raised), hard))
         soft = max(soft, raised)
     return limit if soft == resource.RLIM_INFINITY else min(limit, max(soft - _OTHERS, 8))
+
+
+def started_processes(environment: Mapping[str, str] | None = None) -> int:
+    """How many processes a launcher, such as torchrun, started this one among; 1 without a launcher.
+
+    Args:
+        environment: variables; by default the process's own.
+
+    Raises:
+        UserError: WORLD_SIZE is no count, or `accelerate launch --cpu` was asked for several processes. It starts one
+            where it has no MPI.
+    """
+    variables = os.environ if environment is None else environment
+    world = variables.get("WORLD_SIZE", "1")
+    require(world.isdecimal() and int(world) >= 1, f"WORLD_SIZE={brief(world)} is no count of processes.")
+    on_cpu = variables.get("ACCELERATE_USE_CPU", "").lower() in ("1", "true", "yes")
+    by_mpi = any(name in variables for name in _MPI)
+    # Accelerate names the meeting point alone where more than one process was asked for.
+    require(
+        "WORLD_SIZE" in variables or by_mpi or not (on_cpu and "MASTER_ADDR" in variables),
+        "accelerate launch --cpu was asked for several processes and started one, since it needs MPI for more. Start "
+        "them with torchrun --nproc-per-node <processes> -m mme_vla.train …, or leave --num_processes out.",
+    )
+    return int(world)
+
+
+_MPI = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "MV2_COMM_WORLD_SIZE")
+"""Variables by which MPI counts the processes that it started."""

@@ -257,9 +257,14 @@ def open_source(
         return _of_archive(path)
     if path.is_file():
         return _of_files(path.parent, (path,))
-    if (path / WEIGHTS).is_file() or (path / INDEX).is_file():
-        return _of_files(path, tuple(weight_files(path)))
     params = find_params(path)
+    if (path / WEIGHTS).is_file() or (path / INDEX).is_file():
+        require(
+            params is None,
+            f"{path} holds two sets of weights: safetensors, and Orbax arrays in {params}. Which are meant is not "
+            "known: name the file or folder of one of them, or remove the other.",
+        )
+        return _of_files(path, tuple(weight_files(path)))
     if params is not None:
         return Source("released", params.parent if params.name == "params" else params, params=params)
     if (zipped := find_archive(path)) is not None:

@@ -1,5 +1,6 @@
 """The tasks as plain Gymnasium environments: Gymnasium's own check, and PPO of stable-baselines3."""
 
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,8 @@ import gymnasium
 from gymnasium.utils.env_checker import check_env
 
 import mme_vla.envs.gym
+from mme_vla.envs import rendering
+from mme_vla.errors import UserError
 
 
 @pytest.mark.parametrize("task", ["StopCube", "PatternLock"])
@@ -98,6 +101,12 @@ if __name__ == "__main__":
     assert run_fresh(code).strip() == "['ongoing', 'ongoing']"
 
 
+def test_a_process_forked_after_rendering_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "_process", os.getpid() + 1)
+    with pytest.raises(UserError, match="spawn"):
+        rendering.render_backend()
+
+
 def test_making_a_task_opens_no_simulator() -> None:
     env = mme_vla.envs.gym.GymTask("PatternLock")
     assert env._env is None and env.action_space.shape == (7,)
@@ -115,13 +124,13 @@ def test_an_episode_that_ends_in_an_error_says_why(bad: list[float]) -> None:
 
 
 @pytest.mark.parametrize("max_steps", [1, 4])
-def test_an_episode_is_truncated_at_the_step_after_its_limit(max_steps: int) -> None:
+def test_an_episode_is_truncated_at_its_limit(max_steps: int) -> None:
     env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0, max_steps=max_steps)
     try:
         env.reset()
         hold = np.append(env._observation["state"][:7], 1.0)
-        truncated = [env.step(hold)[3] for _ in range(max_steps + 1)]
-        assert truncated == [False] * max_steps + [True]
+        truncated = [env.step(hold)[3] for _ in range(max_steps)]
+        assert truncated == [False] * (max_steps - 1) + [True]
     finally:
         env.close()
 

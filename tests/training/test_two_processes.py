@@ -8,11 +8,12 @@ import torch
 from torch.func import functional_call
 
 from helpers import commands
-from mme_vla.cli import COMMANDS, SHARED, check_launcher
+from mme_vla.cli import COMMANDS, READING, SHARED, check_launcher
 from mme_vla.cli.train import check_processes
 from mme_vla.errors import UserError
 from mme_vla.model import MMEModel
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
+from mme_vla.utils import started_processes
 
 TORCHRUN = ("torch.distributed.run", "--nproc-per-node", "2", "--master-port")
 TINY = ("backbone=tiny", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1")
@@ -64,22 +65,42 @@ def test_two_processes_without_a_gpu_train_one_policy(tmp_path: Path) -> None:
 def test_processes_that_would_train_apart_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     check_processes(2)
-    with pytest.raises(UserError, match="WORLD_SIZE=2, but 1 of these processes"):
+    with pytest.raises(UserError, match=r"started 2 processes \(WORLD_SIZE\), and each counts 1"):
         check_processes(1)
     monkeypatch.delenv("WORLD_SIZE")
     check_processes(1)
 
 
-@pytest.mark.parametrize("module", sorted({module for module, _ in COMMANDS.values()} - SHARED))
+ALONE = {module for module, _ in COMMANDS.values()} - SHARED - READING
+
+
+@pytest.mark.parametrize("module", sorted(ALONE))
 def test_commands_that_share_no_work_are_refused_under_a_launcher(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(UserError, match="does not share its work"):
+    with pytest.raises(UserError, match="would do all of this command"):
         check_launcher(module)
     monkeypatch.setenv("WORLD_SIZE", "1")
     check_launcher(module)
 
 
-@pytest.mark.parametrize("module", sorted(SHARED))
-def test_commands_that_share_their_work_start_under_a_launcher(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("module", sorted(SHARED | READING))
+def test_commands_that_share_their_work_or_only_read_start_under_a_launcher(
+    module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("WORLD_SIZE", "8")
     check_launcher(module)
+
+
+@pytest.mark.parametrize("world", ["two", "0", "-1", ""])
+def test_a_number_of_processes_that_is_none_is_refused(world: str) -> None:
+    with pytest.raises(UserError, match="no count of processes"):
+        started_processes({"WORLD_SIZE": world})
+
+
+def test_a_launcher_that_started_one_process_of_several_is_refused() -> None:
+    cpu = {"ACCELERATE_USE_CPU": "True"}
+    assert started_processes(cpu) == 1  # one was asked for
+    assert started_processes({**cpu, "MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": "2"}) == 2
+    assert started_processes({**cpu, "MASTER_ADDR": "127.0.0.1", "PMI_SIZE": "2"}) == 1
+    with pytest.raises(UserError, match="torchrun"):
+        started_processes({**cpu, "MASTER_ADDR": "127.0.0.1"})

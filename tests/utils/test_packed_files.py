@@ -40,3 +40,7 @@ def test_the_limit_holds_for_all_streams_together(parts: tuple[bytes, ...], tmp_
 def test_a_stream_that_is_cut_off_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cut off"):
         read_unpacked(packed(tmp_path, lzma.compress(FIRST)[:-10]))
+
+
+def test_many_small_streams_are_read(tmp_path: Path) -> None:
+    assert read_unpacked(packed(tmp_path, lzma.compress(b"one\n") * 20_000)) == b"one\n" * 20_000
