@@ -148,8 +148,8 @@ def resolve_root(root: str | Path) -> Path:
     )
     there = {TASKS: (path / TASKS).exists()}
     there |= {f"{folder}/*/*.parquet": bool(_tables(path, folder)) for folder in ("meta/episodes", "data")}
-    for pattern, found in there.items():
-        if not found:
+    for pattern, present in there.items():
+        if not present:
             raise UserError(f"{path} has no {pattern}: the dataset is incomplete. Copy, download or convert it again.")
     return path
 

@@ -127,13 +127,13 @@ def check_ranges(
                 f"{name} of the {kind.removesuffix('s')} has q01 {of.q01[place]:.6g} and q99 {of.q99[place]:.6g}, but "
                 f"values from {ends[0][place]:.6g} to {ends[1][place]:.6g}"
             )
-        told = "; ".join(lines)
+        summary = "; ".join(lines)
         if narrow == "widen":
-            log.warning("%s. Its range is widened to these values.", told)
+            log.warning("%s. Its range is widened to these values.", summary)
             changed[kind] = widened(of, places, *ends)
             continue
         message = (
-            f"{told}. Normalised by such a range they become numbers in the hundreds to millions, and the loss with "
+            f"{summary}. Normalised by such a range they become numbers in the hundreds to millions, and the loss with "
             "them. If they are broken readings, correct the data. If the number seldom moves, set "
             "data.narrow_ranges=widen: its range then reaches from the least to the greatest value."
         )
@@ -152,7 +152,7 @@ def _extremes(
     video: bool,
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Least and greatest of the states, [s] each, and of the actions as they are predicted, [w] each."""
-    found: dict[str, list[np.ndarray]] = {"state": [], "actions": []}
+    bounds_of: dict[str, list[np.ndarray]] = {"state": [], "actions": []}
     for i, source in enumerate(sources):
         for number in range(len(source)) if episodes is None else episodes[i]:
             episode = int(number)
@@ -161,7 +161,7 @@ def _extremes(
             if not len(steps):
                 continue
             states = source.states(episode)[steps]
-            found["state"] += [states.min(axis=0), states.max(axis=0)]
+            bounds_of["state"] += [states.min(axis=0), states.max(axis=0)]
             if robot.action.frames is None:
                 chunks = np.stack([source.action_chunk(episode, int(t), horizon, action_offset)[0] for t in steps])
             else:
@@ -170,8 +170,8 @@ def _extremes(
                 for place in robot.action.of_pose:
                     chunks[..., place][later >= length] = 0  # as `action_chunk` has them past the end
             relative = robot.action.to_relative(torch.from_numpy(chunks), torch.from_numpy(states)).numpy()
-            found["actions"] += [relative.min(axis=(0, 1)), relative.max(axis=(0, 1))]
-    return tuple((np.min(ends, axis=0), np.max(ends, axis=0)) for ends in found.values())  # type: ignore[return-value]
+            bounds_of["actions"] += [relative.min(axis=(0, 1)), relative.max(axis=(0, 1))]
+    return tuple((np.min(ends, axis=0), np.max(ends, axis=0)) for ends in bounds_of.values())  # type: ignore[return-value]
 
 
 def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.action_space import Option
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT, scene_digest
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import check_known, require
 from mme_vla.registry import ENVS
 

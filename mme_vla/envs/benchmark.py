@@ -8,7 +8,7 @@ from mme_vla.embodiment.robomme import check_benchmark
 from mme_vla.envs import make, metadata
 from mme_vla.envs.base import Environment
 from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
-from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT, scene_digest
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 from mme_vla.errors import require
 from mme_vla.registry import ENVS
 

@@ -28,7 +28,7 @@ from mme_vla.envs.observations import (
 )
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
-from mme_vla.envs.scene_digest import NOT_BUILT, scene_digest
+from mme_vla.envs.scene_hash import NOT_BUILT, scene_digest
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError, check_known, require
@@ -128,7 +128,7 @@ class RoboMMEEnv(gymnasium.Env):
     Attributes:
         on_frame: called with every frame that is returned, for recording.
         render_request: which frames have images, from the next call on; None for all. The others' are None.
-        scene_digest: of the values and places of the scene, from the reset on (`mme_vla.envs.scene_digest`).
+        scene_digest: of the values and places of the scene, from the reset on (`mme_vla.envs.scene_hash`).
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012

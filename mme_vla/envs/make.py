@@ -11,7 +11,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, check_task_name, read_variant
 from mme_vla.envs.observations import Include
 from mme_vla.envs.rows import DIFFICULTIES
-from mme_vla.envs.scene_digest import NO_VALUES
+from mme_vla.envs.scene_hash import NO_VALUES
 from mme_vla.errors import check_known, missing_extra, require
 from mme_vla.registry import TASKS
 

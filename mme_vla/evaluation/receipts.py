@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from mme_vla.config.naming import digest, flat
 from mme_vla.envs.base import Environment, environment
 from mme_vla.envs.make import ROBOMME
-from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, brief, listed, require
 from mme_vla.evaluation.records import EpisodeRecord, count_outcomes
 from mme_vla.evaluation.store import RUN_FILE, read_records, read_run
@@ -146,62 +146,62 @@ def verify(path: Path, checkpoint: Path | None = None, build: bool = True) -> Ve
         UserError: the file is no receipt, or a name in it leads outside of the folder that it is of.
     """
     content = read_receipt(path)
-    found = Verification([], [], [])
-    _compare_settings(found, content["settings"], path.parent)
-    _compare_records(found, content, path.parent, build)
+    result = Verification([], [], [])
+    _compare_settings(result, content["settings"], path.parent)
+    _compare_records(result, content, path.parent, build)
     if not content["conditions"]:
         parts = ("code", "simulator", "renderer", "libraries", "checkpoint", "statistics")
-        found.not_compared.extend(f"{part}: the receipt names no conditions, and has one at least." for part in parts)
+        result.not_compared.extend(f"{part}: the receipt names no conditions, and has one at least." for part in parts)
     for part in content["conditions"]:
-        _compare_conditions(found, part)
-        _compare_checkpoint(found, part, checkpoint)
-    return found.once()
+        _compare_conditions(result, part)
+        _compare_checkpoint(result, part, checkpoint)
+    return result.once()
 
 
 # The records and their settings -----------------------------------------------------------------------------------
 
 
-def _compare_settings(found: Verification, settings: Mapping[str, Any], folder: Path) -> None:
+def _compare_settings(result: Verification, settings: Mapping[str, Any], folder: Path) -> None:
     if (folder / RUN_FILE).is_file():
-        found.differences.extend(_differences("settings", settings, read_run(folder)["settings"]))
+        result.differences.extend(_differences("settings", settings, read_run(folder)["settings"]))
     else:
-        found.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
+        result.not_compared.append(f"settings: {RUN_FILE} is not beside the receipt.")
 
 
-def _compare_records(found: Verification, content: Mapping[str, Any], folder: Path, build: bool) -> None:
+def _compare_records(result: Verification, content: Mapping[str, Any], folder: Path, build: bool) -> None:
     """Digests and score of the records, each record with the settings, and their scenes."""
     settings, name = content["settings"], content["records"].get("file")
     if not isinstance(name, str):
-        found.not_compared.append("records: the receipt names no file of them.")
+        result.not_compared.append("records: the receipt names no file of them.")
         return
     records = inside(folder, name, "records")
     packed = inside(folder, f"{name}.xz", "records")
     records = records if records.is_file() else packed
     if not records.is_file():
-        found.differences.append(f"records: {name} is not beside the receipt, nor {packed.name}.")
+        result.differences.append(f"records: {name} is not beside the receipt, nor {packed.name}.")
         return
     here, lines = to_json(_score(records, settings)), read_records(records)
     for key in ("records", "score", "scenes", "scene_digests"):
         if key in content or here[key]:
-            found.differences.extend(_differences(key, content.get(key), here[key]))
+            result.differences.extend(_differences(key, content.get(key), here[key]))
     if not lines:
-        found.not_compared.append("records: the file has no episode.")
-    _compare_identity(found, lines, content)
+        result.not_compared.append("records: the file has no episode.")
+    _compare_identity(result, lines, content)
     if not isinstance(settings.get("env"), str):
-        found.not_compared.append("scenes: the settings name no environment.")
+        result.not_compared.append("scenes: the settings name no environment.")
         return
     try:
         env = environment(settings["env"])
         for task in {record.task for record in lines}:
             env.check_task(task)
-        _compare_seeds(found, lines, env)
+        _compare_seeds(result, lines, env)
     except UserError as error:  # an environment or a task of a plugin that is not loaded
-        found.not_compared.append(f"scenes: {error}")
+        result.not_compared.append(f"scenes: {error}")
         return
-    _compare_scenes(found, lines, env, build)
+    _compare_scenes(result, lines, env, build)
 
 
-def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]) -> None:
+def _compare_identity(result: Verification, records: Sequence[EpisodeRecord], content: Mapping[str, Any]) -> None:
     """Whether every record is of the settings: model, checkpoint, seed, split, step limit, event, training."""
     settings = content["settings"]
     expected: dict[str, Any] = {}
@@ -209,7 +209,7 @@ def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], con
         if key in settings:
             expected[field] = settings[key]
         else:
-            found.not_compared.append(
+            result.not_compared.append(
                 f"settings.{key}: the receipt does not name it, so no record is compared with it."
             )
     subgoal = settings.get("subgoal")
@@ -217,42 +217,42 @@ def _compare_identity(found: Verification, records: Sequence[EpisodeRecord], con
     expected["event"] = settings.get("event")
     for field, value in expected.items():
         others = [record for record in records if str(getattr(record, field)) != str(value)]
-        _add_records(found, others, field, attrgetter(field), value, "settings")
+        _add_records(result, others, field, attrgetter(field), value, "settings")
     if "training" in content:
         others = [r for r in records if (None if r.training is None else asdict(r.training)) != content["training"]]
-        _add_records(found, others, "training", lambda record: record.training, content["training"], "receipt")
+        _add_records(result, others, "training", lambda record: record.training, content["training"], "receipt")
     named = [record for record in records if "env" in record.extra and "env" in settings]
     others = [record for record in named if record.extra["env"] != settings["env"]]
-    _add_records(found, others, "env", lambda record: record.extra["env"], settings.get("env"), "settings")
+    _add_records(result, others, "env", lambda record: record.extra["env"], settings.get("env"), "settings")
     for field in ("composition", "action_space"):
         values = sorted({str(getattr(record, field)) for record in records})
         if len(values) > 1:
-            found.differences.append(f"records.{field}: several in one run, {', '.join(map(brief, values[:_FEW]))}")
-    _compare_steps(found, records, settings)
+            result.differences.append(f"records.{field}: several in one run, {', '.join(map(brief, values[:_FEW]))}")
+    _compare_steps(result, records, settings)
 
 
-def _compare_steps(found: Verification, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]) -> None:
+def _compare_steps(result: Verification, records: Sequence[EpisodeRecord], settings: Mapping[str, Any]) -> None:
     """Whether no episode is longer than its limit, by which the time that events hold the robot counts as well."""
     from mme_vla.evaluation.rollout.events import read_events
 
     limit = settings.get("max_steps")
     if not isinstance(limit, int):
-        found.not_compared.append("steps: the settings name no step limit.")
+        result.not_compared.append("steps: the settings name no step limit.")
         return
     try:
         limit += _MARGIN + sum(placed.event.hold for placed in read_events(settings.get("event")))
     except UserError as error:
-        found.not_compared.append(f"steps: {error}")
+        result.not_compared.append(f"steps: {error}")
         return
     motions = settings.get("env") in ROBOMME and any(record.action_space in MOTIONS for record in records)
     long = [record for record in records if record.steps < 0 or (record.steps > limit and not motions)]
-    _add_records(found, long, "steps", lambda record: record.steps, f"0 to {limit}", "settings")
+    _add_records(result, long, "steps", lambda record: record.steps, f"0 to {limit}", "settings")
     if motions and any(record.steps > limit for record in records):
-        found.notes.append("steps: some episodes end beyond their limit, with a last action that is a motion of many.")
+        result.notes.append("steps: some episodes end beyond their limit, with a last action that is a motion of many.")
 
 
 def _add_records(
-    found: Verification,
+    result: Verification,
     others: Sequence[EpisodeRecord],
     field: str,
     value_of: Callable[[EpisodeRecord], Any],
@@ -263,50 +263,50 @@ def _add_records(
     if others:
         first = others[0]
         more = f", and {len(others) - 1} more" if len(others) > 1 else ""
-        found.differences.append(
+        result.differences.append(
             f"records.{field}: {brief(value_of(first))} in the record of {brief(first.task, quote=False)} "
             f"{first.episode}{more}; {brief(expected)} by the {where}"
         )
 
 
-def _compare_seeds(found: Verification, records: Iterable[EpisodeRecord], env: Environment) -> None:
+def _compare_seeds(result: Verification, records: Iterable[EpisodeRecord], env: Environment) -> None:
     """Episodes whose seed or difficulty is not the one that the environment gives them here."""
     for record in records:
         spec = env.episode(record.task, record.split, record.episode)
         then, here = f"{record.seed}, {record.difficulty}", f"{spec.seed}, {spec.difficulty}"
-        found.differences.extend(_differences(f"scene {record.task} {record.episode}", then, here))
+        result.differences.extend(_differences(f"scene {record.task} {record.episode}", then, here))
 
 
-def _compare_scenes(found: Verification, records: Sequence[EpisodeRecord], env: Environment, build: bool) -> None:
+def _compare_scenes(result: Verification, records: Sequence[EpisodeRecord], env: Environment, build: bool) -> None:
     """Build the scenes that records name, and compare their digests."""
     unnamed = sum(record.scene is None for record in records)
     valueless = sum(record.scene == NO_VALUES for record in records)
     if unnamed:
-        found.not_compared.append(
+        result.not_compared.append(
             f"scenes: {unnamed} records do not name the scene that was built, as those of earlier versions; seeds and "
             "difficulties alone are compared."
         )
     if valueless:
-        found.not_compared.append(f"scenes: the environment gave no values of {valueless} episodes.")
+        result.not_compared.append(f"scenes: the environment gave no values of {valueless} episodes.")
     named = {(r.task, r.split, r.episode, r.scene) for r in records if r.scene not in (None, NO_VALUES)}
     if named and not build:
-        found.not_compared.append(f"scenes: {len(named)} were not built here, as was asked.")
+        result.not_compared.append(f"scenes: {len(named)} were not built here, as was asked.")
         return
     unbuilt = 0
     for task, split, episode, scene in sorted(named):
         try:
             here = env.scene_digest(env.episode(task, split, episode))
         except UserError as error:
-            found.not_compared.append(f"scenes: they cannot be built here. {error}")
+            result.not_compared.append(f"scenes: they cannot be built here. {error}")
             return
         if scene == NOT_BUILT and here != NOT_BUILT:
             unbuilt += 1
         elif here == NO_VALUES:
-            found.not_compared.append(f"scenes: the environment gives no values of {task} here.")
+            result.not_compared.append(f"scenes: the environment gives no values of {task} here.")
         else:
-            found.differences.extend(_differences(f"scene {task} {episode}", scene, here))
+            result.differences.extend(_differences(f"scene {task} {episode}", scene, here))
     if unbuilt:
-        found.not_compared.append(f"scenes: {unbuilt} episodes ended before their scene was built; it can be here.")
+        result.not_compared.append(f"scenes: {unbuilt} episodes ended before their scene was built; it can be here.")
 
 
 def _score(records: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -357,61 +357,61 @@ def _hardware(on_gpu: bool) -> dict[str, Any]:
     return {"cpu": _cpu(), "gpu": torch.cuda.get_device_name() if on_gpu and torch.cuda.is_available() else None}
 
 
-def _compare_conditions(found: Verification, part: Mapping[str, Any]) -> None:
-    _compare_code(found, part.get("code"))
-    _compare_versions(found, "simulator", part.get("simulator"), SIMULATOR)
-    _compare_versions(found, "libraries", part.get("libraries"), LIBRARIES)
+def _compare_conditions(result: Verification, part: Mapping[str, Any]) -> None:
+    _compare_code(result, part.get("code"))
+    _compare_versions(result, "simulator", part.get("simulator"), SIMULATOR)
+    _compare_versions(result, "libraries", part.get("libraries"), LIBRARIES)
     if "renderer" not in part:
-        found.not_compared.append("renderer: the receipt does not say what rendered.")
+        result.not_compared.append("renderer: the receipt does not say what rendered.")
     elif part["renderer"] is not None:
-        found.differences.extend(_differences("renderer", part["renderer"], _renderer()))
+        result.differences.extend(_differences("renderer", part["renderer"], _renderer()))
     hardware = part.get("hardware")
     if isinstance(hardware, Mapping):
-        found.notes.extend(_differences("hardware", hardware, _hardware(hardware.get("gpu") is not None)))
+        result.notes.extend(_differences("hardware", hardware, _hardware(hardware.get("gpu") is not None)))
     else:
-        found.not_compared.append("hardware: the receipt names none.")
+        result.not_compared.append("hardware: the receipt names none.")
 
 
-def _compare_code(found: Verification, code: Any) -> None:
+def _compare_code(result: Verification, code: Any) -> None:
     """The source of the packages that the receipt's digest covers, if these are all that can change a result."""
     if not isinstance(code, Mapping) or not ({"sha256", "files"} & code.keys()):
-        found.not_compared.append("code: the receipt has no digest of it.")
+        result.not_compared.append("code: the receipt has no digest of it.")
         return
     if "mme-vla" in code:
-        found.differences.extend(_differences("code.mme-vla", code["mme-vla"], version("mme-vla")))
+        result.differences.extend(_differences("code.mme-vla", code["mme-vla"], version("mme-vla")))
     else:
-        found.not_compared.append("code.mme-vla: the receipt does not name the version.")
+        result.not_compared.append("code.mme-vla: the receipt does not name the version.")
     if "sha256" not in code:  # of an earlier version, which digested every file
         if code["files"] != _code([""]):
-            found.not_compared.append(
+            result.not_compared.append(
                 "code: this receipt's digest is of every file of the library, and some file has changed since: whether "
                 "one that can change a result, it cannot tell."
             )
         return
     covers = code.get("covers")
     covered = [package for package in CODE if isinstance(covers, list) and package in covers]
-    found.not_compared.extend(f"code.{package}: not in the digest." for package in CODE if package not in covered)
+    result.not_compared.extend(f"code.{package}: not in the digest." for package in CODE if package not in covered)
     others = [] if not isinstance(covers, list) else [package for package in covers if package not in covered]
     if others:
-        found.not_compared.append(f"code: its digest covers packages that are not compared here, {brief(others)}.")
+        result.not_compared.append(f"code: its digest covers packages that are not compared here, {brief(others)}.")
     elif covered:
-        found.differences.extend(_differences("code.sha256", code["sha256"], _code(covered)))
+        result.differences.extend(_differences("code.sha256", code["sha256"], _code(covered)))
 
 
-def _compare_versions(found: Verification, what: str, then: Any, known: Sequence[str]) -> None:
+def _compare_versions(result: Verification, what: str, then: Any, known: Sequence[str]) -> None:
     """Versions of packages that are named on both sides; the others are not compared."""
     if not isinstance(then, Mapping) or not then:
-        found.not_compared.append(f"{what}: the receipt names no version.")
+        result.not_compared.append(f"{what}: the receipt names no version.")
         return
     common = [name for name in known if name in then]
     here = {name: _version(name) for name in common}
-    found.differences.extend(_differences(what, {name: then[name] for name in common}, here))
+    result.differences.extend(_differences(what, {name: then[name] for name in common}, here))
     lacking = [name for name in known if name not in then and _version(name) is not None]
     others = [name for name in then if name not in known]
     if lacking:
-        found.not_compared.append(f"{what}: the receipt does not name the version of {listed(lacking)}.")
+        result.not_compared.append(f"{what}: the receipt does not name the version of {listed(lacking)}.")
     if others:
-        found.not_compared.append(f"{what}: {listed(others)} of the receipt are no packages that are compared.")
+        result.not_compared.append(f"{what}: {listed(others)} of the receipt are no packages that are compared.")
 
 
 # The checkpoint ---------------------------------------------------------------------------------------------------
@@ -439,12 +439,12 @@ def _loaded(folder: Path) -> list[str]:
     return sorted(name for name in names if not name.startswith(_OF_TRAINING))
 
 
-def _compare_checkpoint(found: Verification, part: Mapping[str, Any], checkpoint: Path | None) -> None:
+def _compare_checkpoint(result: Verification, part: Mapping[str, Any], checkpoint: Path | None) -> None:
     """Every file that the policy was loaded from, none beside these, and the statistics."""
     named = part.get("checkpoint")
     files = named.get("files") if isinstance(named, Mapping) else None
     if not isinstance(files, Mapping) or not files:
-        found.not_compared.append("checkpoint: no file of it was on the machine of the run, so none is compared.")
+        result.not_compared.append("checkpoint: no file of it was on the machine of the run, so none is compared.")
         files = {}
     folder = named.get("folder") if isinstance(named, Mapping) else None
     place = checkpoint
@@ -453,19 +453,19 @@ def _compare_checkpoint(found: Verification, part: Mapping[str, Any], checkpoint
     if place is None or not (place / _CONFIG).is_file():
         text = "its folder" if place is None else brief(str(place), 200, quote=False)
         hint = "Name its folder with --checkpoint."
-        found.not_compared.append(f"checkpoint: {text} is not here, or has no {_CONFIG}. {hint}")
-        found.not_compared.append(f"statistics: not without the checkpoint. {hint}")
+        result.not_compared.append(f"checkpoint: {text} is not here, or has no {_CONFIG}. {hint}")
+        result.not_compared.append(f"statistics: not without the checkpoint. {hint}")
         return
     if files:
         here = _sums(place, [*files, *(name for name in _loaded(place) if name not in files)])
-        found.differences.extend(_differences("checkpoint", files, here))
+        result.differences.extend(_differences("checkpoint", files, here))
     if part.get("statistics") is None:
-        found.not_compared.append("statistics: the receipt has no digest of them.")
+        result.not_compared.append("statistics: the receipt has no digest of them.")
     elif not (place / STATS_FILE).is_file():
-        found.not_compared.append(f"statistics: {place} has no {STATS_FILE}.")
+        result.not_compared.append(f"statistics: {place} has no {STATS_FILE}.")
     else:
         statistics = digest(NormStats.load(place / STATS_FILE).to_dict(), 64)
-        found.differences.extend(_differences("statistics", part["statistics"], statistics))
+        result.differences.extend(_differences("statistics", part["statistics"], statistics))
 
 
 def _sums(folder: Path, names: Iterable[str]) -> dict[str, str | None]:

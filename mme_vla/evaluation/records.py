@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, NamedTuple, Self
 
 from mme_vla.config.sections import Range, read_section
-from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.errors import UserError, check_choice, require
 from mme_vla.policy.training_identity import TrainingIdentity
 from mme_vla.utils import parse_json, to_line, verified
@@ -68,7 +68,7 @@ class EpisodeRecord:
     model: name of the model (`framesamp_modul`). checkpoint: its step, or a name.
     model_seed: of the policy's noise; it does not reach the environment.
     task, episode: which episode of the split; seed, difficulty: the environment's, from the benchmark's metadata.
-    scene: digest of the scene's values and places (`mme_vla/envs/scene_digest.py`); `no values` of an environment that
+    scene: digest of the scene's values and places (`mme_vla/envs/scene_hash.py`); `no values` of an environment that
         gives none, `not built` where the episode ended before; None in records from before there were digests.
     outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error` (see `error`).
     steps: control steps executed, one an action but for planned motions. seconds: where the time went.

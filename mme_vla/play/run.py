@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.envs.scene_digest import NOT_BUILT
+from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.results.scopes import PAPER_ORDER

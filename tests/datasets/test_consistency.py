@@ -41,17 +41,17 @@ def opened(root: Path, **action: Any) -> EpisodeSource:
     return EpisodeSource(root, robot=own_robot(**action))
 
 
-def shown(source: EpisodeSource, episode: int) -> list[int]:
+def frames_read(source: EpisodeSource, episode: int) -> list[int]:
     """Which frames of the dataset an episode's pictures are."""
-    pictures = source.frames(episode, np.arange(source.lengths[episode]))
-    return [round(float(image.mean()) / SHADE) for image in pictures]
+    images = source.frames(episode, np.arange(source.lengths[episode]))
+    return [round(float(image.mean()) / SHADE) for image in images]
 
 
 @pytest.mark.parametrize("video", [False, True])
 def test_a_dataset_without_faults_opens_without_a_word(tmp_path: Path, video: bool, caplog) -> None:
     source = opened(write_dataset(tmp_path, video=video))
     assert [source.goal(episode) for episode in (0, 1)] == list(TASKS)
-    assert shown(source, 1) == [5, 6, 7, 8]
+    assert frames_read(source, 1) == [5, 6, 7, 8]
     assert not caplog.text
 
 
@@ -253,7 +253,7 @@ def test_pictures_are_right_up_to_a_drift_of_half_a_frame_and_refused_beyond(tmp
         change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", begins)
         change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", begins + np.array([5, 4]) / FPS)
         if right:
-            assert shown(opened(tmp_path), 1) == [5, 6, 7, 8]
+            assert frames_read(opened(tmp_path), 1) == [5, 6, 7, 8]
             continue
         with pytest.raises(UserError, match=r"of episode 1 is looked for at|episodes 0 and 1 overlap"):
             opened(tmp_path)
@@ -294,17 +294,17 @@ def test_a_video_with_more_pictures_than_rows_is_read_where_they_lie(tmp_path: P
     write_video(tmp_path / VIDEO, [picture(SHADE * i) for i in range(12)])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", [0.0, 0.7])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 1.1])
-    assert shown(opened(tmp_path), 1) == [7, 8, 9, 10]
+    assert frames_read(opened(tmp_path), 1) == [7, 8, 9, 10]
     twice = [picture(SHADE * (i // 2)) for i in range(18)]  # twice as many a second
     write_video(tmp_path / VIDEO, twice, 2 * FPS)
     change(tmp_path, EPISODES, f"videos/{CAMERA}/from_timestamp", [0.0, 0.5])
     change(tmp_path, EPISODES, f"videos/{CAMERA}/to_timestamp", [0.5, 0.9])
-    assert shown(opened(tmp_path), 1) == [5, 6, 7, 8]
+    assert frames_read(opened(tmp_path), 1) == [5, 6, 7, 8]
 
 
 def test_a_rate_that_is_no_whole_number_is_read(tmp_path: Path) -> None:
     write_dataset(tmp_path, lengths=(6, 6), video=True, fps=29.97)
-    assert shown(opened(tmp_path), 1) == [6, 7, 8, 9, 10, 11]
+    assert frames_read(opened(tmp_path), 1) == [6, 7, 8, 9, 10, 11]
 
 
 def test_a_missing_video_and_pictures_of_another_size_are_noticed_on_opening(tmp_path: Path, caplog) -> None:
@@ -351,7 +351,7 @@ def test_pictures_of_more_than_eight_bits_are_refused_wherever_they_are(tmp_path
 def test_grey_pictures_of_eight_bits_are_colours(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     change(tmp_path, ROWS, CAMERA, pa.array([cell(np.full((32, 32), SHADE * i, np.uint8)) for i in range(9)]))
-    assert shown(opened(tmp_path), 0) == [0, 1, 2, 3, 4]
+    assert frames_read(opened(tmp_path), 0) == [0, 1, 2, 3, 4]
 
 
 def test_a_video_of_deep_grey_is_refused_whatever_is_written_of_it(tmp_path: Path) -> None:
@@ -441,14 +441,17 @@ def test_what_is_known_of_a_video_is_read_under_both_names() -> None:
 def test_files_are_ordered_by_their_numbers(tmp_path: Path, folder: str) -> None:
     write_dataset(tmp_path)
     path = tmp_path / folder / "chunk-000" / "file-000.parquet"
-    whole = pq.ParquetFile(path).read()
+    source_root = pq.ParquetFile(path).read()
     path.unlink()
     cut = 5 if folder == "data" else 1
-    for chunk, number, part in (("chunk-999", 999, whole.slice(0, cut)), ("chunk-1000", 1000, whole.slice(cut))):
+    for chunk, number, part in (
+        ("chunk-999", 999, source_root.slice(0, cut)),
+        ("chunk-1000", 1000, source_root.slice(cut)),
+    ):
         table(tmp_path / folder / chunk / f"file-{number}.parquet", {n: part[n] for n in part.column_names})
     source = opened(tmp_path)
     assert source.states(0)[0].tolist() == pytest.approx(whole_state(tmp_path, folder))
-    assert shown(source, 1) == [5, 6, 7, 8]
+    assert frames_read(source, 1) == [5, 6, 7, 8]
 
 
 def whole_state(root: Path, folder: str) -> list[float]:
@@ -518,9 +521,9 @@ def test_datasets_that_lerobot_edited_are_in_order(tmp_path: Path, caplog) -> No
     from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    whole = LeRobotDataset("local/sample", root=SAMPLE, video_backend="pyav")
-    shorter = delete_episodes(whole, [1], output_dir=tmp_path / "shorter", repo_id="local/shorter")
-    merge_datasets([whole, shorter], "local/both", output_dir=tmp_path / "both")
+    source_root = LeRobotDataset("local/sample", root=SAMPLE, video_backend="pyav")
+    shorter = delete_episodes(source_root, [1], output_dir=tmp_path / "shorter", repo_id="local/shorter")
+    merge_datasets([source_root, shorter], "local/both", output_dir=tmp_path / "both")
     with caplog.at_level(logging.WARNING, logger="mme_vla"):
         sources = [EpisodeSource(tmp_path / name) for name in ("shorter", "both")]
     expected = [EpisodeSource("sample").goal(e) for e in (0, 2, 3)]

@@ -42,8 +42,8 @@ def recorded_video(task: str, episode: int) -> tuple[list[str], str]:
 def test_a_video_has_the_texts_of_its_recording(task: str, episode: int) -> None:
     video, after = recorded_video(task, episode)
     env = make_env(task, "train", episode, action_space="ee_pose", render=False, recovery=None)
-    shown: list[str] = []
-    env.on_frame = lambda _, info, in_video: shown.append(info["simple_subgoal_online"])
+    displayed: list[str] = []
+    env.on_frame = lambda _, info, in_video: displayed.append(info["simple_subgoal_online"])
     env.reset()
     expected: list[str] = []
     for word in video:
@@ -52,7 +52,7 @@ def test_a_video_has_the_texts_of_its_recording(task: str, episode: int) -> None
     execution = next(step.text for step in env.task.progress.subtasks if not step.video)
     assert not env.task.recording
     env.close()
-    assert shown[:-1] == expected
+    assert displayed[:-1] == expected
     assert after == execution
 
 

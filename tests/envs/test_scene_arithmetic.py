@@ -89,12 +89,12 @@ def test_quaternions_have_the_recorded_bits() -> None:
 
 def test_the_smallest_box_of_a_turned_box_has_its_widths_in_order_and_its_axes() -> None:
     widths = np.array([0.3, 0.1, 0.2])
-    turn = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
+    rotation = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
     mesh = box(widths)
-    mesh.apply_transform(np.block([[turn, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]))
-    axes, found = smallest_box(mesh)
-    assert found == pytest.approx(sorted(widths), abs=1e-12)
-    assert np.abs(axes @ turn) == pytest.approx(np.eye(3)[[1, 2, 0]], abs=1e-9)
+    mesh.apply_transform(np.block([[rotation, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]))
+    axes, measured = smallest_box(mesh)
+    assert measured == pytest.approx(sorted(widths), abs=1e-12)
+    assert np.abs(axes @ rotation) == pytest.approx(np.eye(3)[[1, 2, 0]], abs=1e-9)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 1.3])

@@ -128,9 +128,9 @@ def in_order(texts: Iterable[str]) -> list[str]:
     return [word for word, _ in groupby(texts)]
 
 
-def first_contact(shown: list[Shown]) -> int:
+def first_contact(displayed: list[Shown]) -> int:
     """The first frame in which the robot touches something; the number of frames where there is none."""
-    return next((k for k, frame in enumerate(shown) if frame.touches), len(shown))
+    return next((k for k, frame in enumerate(displayed) if frame.touches), len(displayed))
 
 
 def ends(texts: list[str]) -> list[int]:
@@ -157,46 +157,46 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
     included = {"include_wrist_camera_extrinsic": True, "include_available_multi_choices": True}
     env = make_env(episode.ref.task, action_space=space, render=False, max_steps=5000, **episode.scene, **included)
     env.task.recording = space == "joint_angle"  # drops and waits are judged as when the episode was recorded
-    shown: list[Shown] = []
-    env.on_frame = lambda frame, info, in_video: shown.append(
+    displayed: list[Shown] = []
+    env.on_frame = lambda frame, info, in_video: displayed.append(
         Shown(info["simple_subgoal_online"], in_video, touches(env.task))
     )
     observation, info = env.reset()
     assert info["task_goal"] == episode.goals and info["available_multi_choices"] == episode.options
-    assert not shown[-1].in_video
-    check_video(episode, shown[:-1], observation["joint_state_list"][:-1])
-    start = len(shown)
+    assert not displayed[-1].in_video
+    check_video(episode, displayed[:-1], observation["joint_state_list"][:-1])
+    start = len(displayed)
     for k, action in episode.timed_actions(space):
         waited = k - episode.execution - (env.steps_counted - 1)
         if space == "waypoint" and episode.ref.task in WAITING and waited > 0:
             env.step(Hold(waited))
         observation, _, terminated, _, info = env.step(action)
         if space == "joint_angle":
-            check_states(episode, k, observation, touched=first_contact(shown) < len(shown))
+            check_states(episode, k, observation, touched=first_contact(displayed) < len(displayed))
         if bool(terminated):
             break
     env.close()
     assert info["status"] == "success", info.get("error_message")
-    words = [frame.text for frame in shown[start:]]
+    words = [frame.text for frame in displayed[start:]]
     recorded = episode.words("simple_subgoal_online", range(episode.execution, episode.length))
     assert in_order(words) == in_order(recorded)
     if space == "joint_angle":
-        check_ends(words, recorded, first_contact(shown) - start)
+        check_ends(words, recorded, first_contact(displayed) - start)
 
 
-def check_video(episode: Episode, shown: list[Shown], states: list[np.ndarray]) -> None:
+def check_video(episode: Episode, displayed: list[Shown], states: list[np.ndarray]) -> None:
     """The video has the recorded frames, each with its text and its joint positions."""
     official = episode.words("simple_subgoal_online", range(episode.execution))
-    contact = first_contact(shown)
-    assert all(frame.in_video for frame in shown)
-    words, told = [frame.text for frame in shown], list[str]()
+    contact = first_contact(displayed)
+    assert all(frame.in_video for frame in displayed)
+    words, announced = [frame.text for frame in displayed], list[str]()
     for word in official:
         # A frame whose recorded text is none goes on with the text of the sub-task that is demonstrated.
-        told.append(word if word != NO_RECORD else told[-1])
-    assert in_order(words) == in_order(told)
-    check_ends(words, told, contact)
-    assert abs(len(shown) - len(official)) <= (AFTER_CONTACT_STEPS if contact < len(shown) else 0)
-    for k in range(min(len(shown), len(official))):
+        announced.append(word if word != NO_RECORD else announced[-1])
+    assert in_order(words) == in_order(announced)
+    check_ends(words, announced, contact)
+    assert abs(len(displayed) - len(official)) <= (AFTER_CONTACT_STEPS if contact < len(displayed) else 0)
+    for k in range(min(len(displayed), len(official))):
         tolerance = BEFORE_CONTACT if k < contact else AFTER_CONTACT
         np.testing.assert_allclose(states[k], episode.at(k, "obs/joint_state"), atol=tolerance, err_msg=f"video, {k}")
 

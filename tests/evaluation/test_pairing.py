@@ -16,7 +16,7 @@ from helpers.rollout_fakes import JOBS, quick_policy, records, roll, save_record
 from helpers.scripted_env import ScriptedEnv
 from mme_vla import UserError
 from mme_vla.cli.results import main
-from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import aggregate, repeated_episodes

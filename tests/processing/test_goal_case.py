@@ -42,8 +42,8 @@ def test_a_new_policy_of_ones_own_robot_reads_what_it_was_trained_on(tmp_path: P
 def test_subgoals_are_spelled_alike_too() -> None:
     processor = own_processor(prompt="subgoal")
     assert ids(processor, GOAL, subgoal="Grasp IT") == ids(processor, GOAL, subgoal="grasp it")
-    given = own_processor(prompt="subgoal", goal_case="given")
-    assert ids(given, GOAL, subgoal="Grasp IT") != ids(given, GOAL, subgoal="grasp it")
+    goal_text = own_processor(prompt="subgoal", goal_case="given")
+    assert ids(goal_text, GOAL, subgoal="Grasp IT") != ids(goal_text, GOAL, subgoal="grasp it")
 
 
 def test_a_checkpoint_from_before_keeps_its_tokens(tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_simplememvla_spells_alike() -> None:
     from mme_vla.methods.simplememvla.processor import PromptSettings, SimpleMemVlaProcessor
 
     robot = own_robot(horizon=20)
-    given, lower = (
+    goal_text, lower = (
         SimpleMemVlaProcessor(PromptSettings(tokenizer="bytes", goal_case=case), robot, 32) for case in (None, "lower")
     )
-    assert GOAL in given.prompt(GOAL)
+    assert GOAL in goal_text.prompt(GOAL)
     assert GOAL.lower() in lower.prompt(GOAL) and GOAL not in lower.prompt(GOAL)

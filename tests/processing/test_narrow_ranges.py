@@ -47,9 +47,9 @@ def test_a_number_that_seldom_moves_is_named_refused_or_widened(tmp_path: Path, 
     assert widened.q01[1] == 0 and widened.q99[1] == pytest.approx(1, abs=1e-3)
     target = normalize(torch.tensor([[0.0, 0.0, 0.0]]), widened)[0, 1]
     assert target == pytest.approx(-1, abs=1e-3)
-    plain = compute_norm_stats([source], **options).actions
+    unscaled = compute_norm_stats([source], **options).actions
     assert "grip of the action has q01" in caplog.text
-    assert np.array_equal(plain.q01[[0, 2]], widened.q01[[0, 2]])  # the others stay as they are
+    assert np.array_equal(unscaled.q01[[0, 2]], widened.q01[[0, 2]])  # the others stay as they are
 
 
 @pytest.mark.parametrize(
@@ -133,8 +133,8 @@ def test_one_value_far_away_does_not_move_the_running_quantiles(outlier: float, 
     for begin in range(0, 400, 100):
         running.update(rows[begin : begin + 100])
         exact.update(rows[begin : begin + 100])
-    found, expected = running.result(), exact.result()
-    assert np.abs(found.q01 - expected.q01).max() < 0.12 and np.abs(found.q99 - expected.q99).max() < 0.12
+    measured, expected = running.result(), exact.result()
+    assert np.abs(measured.q01 - expected.q01).max() < 0.12 and np.abs(measured.q99 - expected.q99).max() < 0.12
 
 
 def test_quantiles_of_ordinary_values_are_the_released_ones() -> None:

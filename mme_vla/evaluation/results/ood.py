@@ -14,7 +14,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.metadata import BASE, HARD, TWIN, read_variant
 from mme_vla.envs.rows import OOD, TIERS
-from mme_vla.envs.scene_digest import scene_digest
+from mme_vla.envs.scene_hash import scene_digest
 from mme_vla.evaluation.pairing import pair
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, by_run, merge
 from mme_vla.evaluation.results.aggregate import Interval, repeated_episodes, wilson

@@ -20,7 +20,7 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
 from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.oracle import oracle_of
-from mme_vla.envs.scene_digest import NO_VALUES
+from mme_vla.envs.scene_hash import NO_VALUES
 from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import require
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name

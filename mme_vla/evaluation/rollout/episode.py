@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment.action_space import read_options
-from mme_vla.envs.scene_digest import NOT_BUILT
+from mme_vla.envs.scene_hash import NOT_BUILT
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds

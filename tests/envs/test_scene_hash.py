@@ -10,7 +10,7 @@ import pytest
 from mme_vla import UserError
 from mme_vla.envs.base import Environment, EpisodeEnv, environment
 from mme_vla.envs.metadata import EpisodeSpec, read_row
-from mme_vla.envs.scene_digest import NO_VALUES, NOT_BUILT, scene_digest
+from mme_vla.envs.scene_hash import NO_VALUES, NOT_BUILT, scene_digest
 
 VALUES: dict[str, Any] = {"layout": {"xy": [0.1, -0.25], "yaw": 1.5}, "objects": {"count": 3, "colours": ["red"]}}
 
