@@ -128,8 +128,8 @@ def _check_totals(dataset: Description) -> None:
     if not np.array_equal(declared, lengths):
         episode = int(np.flatnonzero(declared != lengths)[0])
         raise UserError(
-            f"{dataset.root}/meta/episodes: episode {episode} has length {declared[episode]}, but dataset_from_index and "
-            f"dataset_to_index give it {lengths[episode]} rows. {_CORRECT}"
+            f"{dataset.root}/meta/episodes: episode {episode} has length {declared[episode]}, but dataset_from_index "
+            f"and dataset_to_index give it {lengths[episode]} rows. {_CORRECT}"
         )
 
 

@@ -441,12 +441,12 @@ def test_what_is_known_of_a_video_is_read_under_both_names() -> None:
 def test_files_are_ordered_by_their_numbers(tmp_path: Path, folder: str) -> None:
     write_dataset(tmp_path)
     path = tmp_path / folder / "chunk-000" / "file-000.parquet"
-    source_root = pq.ParquetFile(path).read()
+    reference = pq.ParquetFile(path).read()
     path.unlink()
     cut = 5 if folder == "data" else 1
     for chunk, number, part in (
-        ("chunk-999", 999, source_root.slice(0, cut)),
-        ("chunk-1000", 1000, source_root.slice(cut)),
+        ("chunk-999", 999, reference.slice(0, cut)),
+        ("chunk-1000", 1000, reference.slice(cut)),
     ):
         table(tmp_path / folder / chunk / f"file-{number}.parquet", {n: part[n] for n in part.column_names})
     source = opened(tmp_path)
@@ -521,9 +521,9 @@ def test_datasets_that_lerobot_edited_are_in_order(tmp_path: Path, caplog) -> No
     from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    source_root = LeRobotDataset("local/sample", root=SAMPLE, video_backend="pyav")
-    shorter = delete_episodes(source_root, [1], output_dir=tmp_path / "shorter", repo_id="local/shorter")
-    merge_datasets([source_root, shorter], "local/both", output_dir=tmp_path / "both")
+    reference = LeRobotDataset("local/sample", root=SAMPLE, video_backend="pyav")
+    shorter = delete_episodes(reference, [1], output_dir=tmp_path / "shorter", repo_id="local/shorter")
+    merge_datasets([reference, shorter], "local/both", output_dir=tmp_path / "both")
     with caplog.at_level(logging.WARNING, logger="mme_vla"):
         sources = [EpisodeSource(tmp_path / name) for name in ("shorter", "both")]
     expected = [EpisodeSource("sample").goal(e) for e in (0, 2, 3)]
