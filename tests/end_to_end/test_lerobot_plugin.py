@@ -1,6 +1,7 @@
 """plugins/lerobot_policy_mme_vla in one process: the numbers are those of the policy itself, and folders come back."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -146,6 +147,16 @@ def test_a_checkpoint_goes_there_and_back(
         package.convert.main([str(lerobot_folder), str(our_folder)])
 
 
+def test_an_earlier_folder_whose_sums_lack_the_configuration_is_converted(
+    package: ModuleType, lerobot_folder: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(lerobot_folder, tmp_path / "earlier"))
+    lines = (folder / "SHA256SUMS").read_text().splitlines(keepends=True)
+    (folder / "SHA256SUMS").write_text("".join(line for line in lines if not line.endswith("  config.json\n")))
+    package.convert.main([str(folder), str(tmp_path / "back")])
+    assert (tmp_path / "back" / "model.safetensors").is_file()
+
+
 def test_damage_and_strange_code_are_refused(package: ModuleType, lerobot_folder: Path, tmp_path: Path) -> None:
     from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 
@@ -156,9 +167,13 @@ def test_damage_and_strange_code_are_refused(package: ModuleType, lerobot_folder
     (tmp_path / "config.json").write_text(
         json.dumps(config | {"composition": json.dumps(sections | {"plugins": ["somebodys_code"]})})
     )
+    with pytest.raises(UserError, match=r"config\.json is damaged"):
+        MMEVLAPolicy.from_pretrained(tmp_path)
+    (tmp_path / "SHA256SUMS").rename(tmp_path / "sums")
     with pytest.raises(UserError, match="needs the plugin somebodys_code"):
         MMEVLAPolicy.from_pretrained(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "sums").rename(tmp_path / "SHA256SUMS")
+    shutil.copy(lerobot_folder / "config.json", tmp_path)
     weights = bytearray((tmp_path / "model.safetensors").read_bytes())
     weights[-3] ^= 1
     (tmp_path / "model.safetensors").write_bytes(weights)

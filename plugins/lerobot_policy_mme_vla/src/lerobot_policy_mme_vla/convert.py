@@ -14,7 +14,8 @@ from mme_vla.cli.errors import print_user_errors
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError
-from mme_vla.policy.saving import local_folder, read_config
+from mme_vla.policy.saving import CONFIG, local_folder
+from mme_vla.utils import Sums, inside, read_json
 
 
 def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
@@ -45,7 +46,9 @@ def convert(source: str, target: Path) -> None:
     if target.exists():
         raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
     folder = local_folder(source)
-    if read_config(folder).get("type") == MMEVLAPolicy.name:
+    Sums(folder).check(CONFIG)  # earlier folders of this plugin do not list it
+    config = read_json(inside(folder, CONFIG), "a policy's configuration", limit=2**20)
+    if config.get("type") == MMEVLAPolicy.name:
         MMEVLAPolicy.from_pretrained(folder).model.save_pretrained(target)
         return
     lerobot_policy = for_lerobot(Policy.from_pretrained(folder))

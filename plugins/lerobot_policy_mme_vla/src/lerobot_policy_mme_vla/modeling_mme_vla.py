@@ -22,6 +22,7 @@ from mme_vla.policy.build import build_from_config
 from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.saving import (
+    CONFIG,
     build_saved,
     check_processor,
     local_folder,
@@ -31,7 +32,7 @@ from mme_vla.policy.saving import (
 from mme_vla.policy.tensor_files import WEIGHTS, assign_tensors, load_tensors
 from mme_vla.processing.base import load_processor
 from mme_vla.training.data import check_frozen
-from mme_vla.utils import write_sums
+from mme_vla.utils import Sums, write_sums
 from mme_vla.weights import start_from
 
 PREFIX = "model."
@@ -172,7 +173,7 @@ class MMEVLAPolicy(PreTrainedPolicy):
         self, save_directory: Path, **options: Any
     ) -> None:  # 0.6.1 hands over a state_dict, later none
         super()._save_pretrained(save_directory, **options)
-        write_sums(save_directory, [WEIGHTS, *self.model.require_processor().save(save_directory)])
+        write_sums(save_directory, [CONFIG, WEIGHTS, *self.model.require_processor().save(save_directory)])
 
     @classmethod
     def from_pretrained(  # type: ignore[override]
@@ -193,6 +194,7 @@ class MMEVLAPolicy(PreTrainedPolicy):
                 (`--policy.discover_packages_path=<package>` imports one).
         """
         folder = local_folder(pretrained_name_or_path, revision, token)
+        Sums(folder).check(CONFIG)  # earlier folders of this plugin do not list it
         settings: Any = PreTrainedConfig.from_pretrained(folder) if config is None else config
         if settings.composition is None:
             raise UserError(f"{folder} holds no configuration of mme-vla: its config.json lacks 'composition'.")
