@@ -235,7 +235,8 @@ class RoboMMEEnv(gymnasium.Env):
             return {}, 0.0, True, False, {"status": "error", "error_message": str(error)}
         except Exception as error:  # the official contract: whatever goes wrong is a status
             log.debug("step failed", exc_info=True)
-            info = {"status": "error", "error_message": str(error), "exception_type": type(error).__name__}
+            kind = type(error).__name__
+            info = {"status": "error", "error_message": str(error) or f"{kind}, without a text", "exception_type": kind}
             return None, 0.0, True, False, info
         finally:
             self._muted = False

@@ -123,6 +123,17 @@ def test_an_episode_that_ends_in_an_error_says_why(bad: list[float]) -> None:
         env.close()
 
 
+def test_an_exception_without_a_text_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0)
+    try:
+        env.reset()
+        monkeypatch.setattr(env._env._space, "act", lambda control, action: (_ for _ in ()).throw(RuntimeError))
+        info = env.step(np.zeros(8))[4]
+        assert info["status"] == "error" and info["error_message"].startswith("RuntimeError")
+    finally:
+        env.close()
+
+
 @pytest.mark.parametrize("max_steps", [1, 4])
 def test_an_episode_is_truncated_at_its_limit(max_steps: int) -> None:
     env = mme_vla.envs.gym.GymTask("StopCube", images=False, episode=0, max_steps=max_steps)
