@@ -196,10 +196,9 @@ def test_missing_or_old_vulkan_says_what_to_install(
     fake = SimpleNamespace(render=SimpleNamespace(get_device_summary=describe), Device=device)
     monkeypatch.setitem(sys.modules, "sapien", fake)  # type: ignore[arg-type]
     monkeypatch.setattr(rendering, "mesa_version", lambda: mesa)
-    rendering.render_backend.cache_clear()
+    monkeypatch.setattr(rendering, "_find_backend", rendering._find_backend.__wrapped__)
     with pytest.raises(UserError, match=f"{words}[\\s\\S]*install_vulkan.sh"):
         rendering.render_backend()
-    rendering.render_backend.cache_clear()
 
 
 class _Builder:
